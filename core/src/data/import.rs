@@ -1,0 +1,1 @@
+//! Other projects' datasets, read into ours.

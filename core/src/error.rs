@@ -1,0 +1,85 @@
+//! The one error type of the core library. Every variant carries what a person needs to find the fault:
+//! the path, the tensor's shape, or the option.
+
+use std::path::{Path, PathBuf};
+
+/// What can go wrong in `cnerf-core`.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A file could not be opened, read, written or renamed.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder at fault.
+        path: PathBuf,
+        /// The operating system's word.
+        source: std::io::Error,
+    },
+    /// A file was read but is not what it should be. `reason` says what is wrong and what to do.
+    #[error("{}: {reason}", path.display())]
+    Malformed {
+        /// The file at fault.
+        path: PathBuf,
+        /// What is wrong with it, and the remedy.
+        reason: String,
+    },
+    /// A tensor has another shape than its use demands.
+    #[error("{name}: expected shape {expected}, found {found:?}")]
+    Shape {
+        /// The tensor's name.
+        name: String,
+        /// What was expected, in words or as a shape.
+        expected: String,
+        /// What was found.
+        found: Vec<usize>,
+    },
+    /// An option or configuration field has a value that cannot be used.
+    #[error("{option}: {reason}")]
+    Config {
+        /// The option or the dotted path of the field.
+        option: String,
+        /// Why the value cannot be used, and what can.
+        reason: String,
+    },
+    /// A number that must be finite is not.
+    #[error("{quantity} is not finite{}", context.as_ref().map(|c| format!(" ({c})")).unwrap_or_default())]
+    NotFinite {
+        /// The quantity, e.g. a loss term.
+        quantity: String,
+        /// Where it was seen and what to do.
+        context: Option<String>,
+    },
+    /// The tensor library's error.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// The core library's result.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+impl Error {
+    /// An [`Error::Io`] at `path`; made to be used as `.map_err(|e| Error::io(path, e))`.
+    pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
+        Self::Io { path: path.as_ref().to_owned(), source }
+    }
+
+    /// An [`Error::Malformed`] at `path`.
+    pub fn malformed(path: impl AsRef<Path>, reason: impl std::fmt::Display) -> Self {
+        Self::Malformed { path: path.as_ref().to_owned(), reason: reason.to_string() }
+    }
+
+    /// An [`Error::Shape`] of the tensor called `name`.
+    pub fn shape(name: impl Into<String>, expected: impl std::fmt::Debug, found: &[usize]) -> Self {
+        Self::Shape { name: name.into(), expected: format!("{expected:?}"), found: found.to_vec() }
+    }
+
+    /// An [`Error::Config`] of the option called `option`.
+    pub fn config(option: impl Into<String>, reason: impl std::fmt::Display) -> Self {
+        Self::Config { option: option.into(), reason: reason.to_string() }
+    }
+
+    /// An [`Error::NotFinite`] without further context.
+    pub fn not_finite(quantity: impl Into<String>) -> Self {
+        Self::NotFinite { quantity: quantity.into(), context: None }
+    }
+}

@@ -1,0 +1,6 @@
+//! Other programs' files: the authors' checkpoints, meshes, animations.
+
+pub mod animation;
+pub mod mesh;
+pub mod sheet;
+pub mod torch;

@@ -1,0 +1,1 @@
+//! Surfaces as GLB, PLY and OBJ.

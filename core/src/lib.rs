@@ -1,0 +1,23 @@
+//! The compositional neural radiance field of portraits: nine local fields, one per region, fused by learnt masks
+//! over one signed distance field, rendered and lifted to pictures; how to train it, and how to measure it.
+//!
+//! A floor uses only floors below it:
+//! vocabulary ([`region`], [`camera`], [`codes`], [`config`], [`parameters`], [`rng`], [`error`]) →
+//! [`kernels`] → [`render`] → [`model`] → [`data`] / [`train`] → [`eval`] / [`interop`].
+
+pub mod camera;
+pub mod codes;
+pub mod config;
+pub mod data;
+pub mod error;
+pub mod eval;
+pub mod interop;
+pub mod kernels;
+pub mod model;
+pub mod parameters;
+pub mod region;
+pub mod render;
+pub mod rng;
+pub mod train;
+
+pub use error::{Error, Result};

@@ -1,0 +1,1 @@
+//! The global, semantic and high-resolution discriminators.

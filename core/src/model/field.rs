@@ -1,0 +1,1 @@
+//! The compositional field: nine local generators over one signed distance.

@@ -1,0 +1,1 @@
+//! The style-based 2D generator.

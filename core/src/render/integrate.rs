@@ -1,0 +1,1 @@
+//! Volume aggregation along rays.

@@ -1,0 +1,4 @@
+//! Losses, the trainer and its checkpoints.
+
+pub mod adversarial;
+pub mod losses;

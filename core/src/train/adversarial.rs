@@ -1,0 +1,1 @@
+//! Adversarial losses and their exact gradient penalties.

@@ -1,0 +1,1 @@
+//! Losses on the field and its renders.
