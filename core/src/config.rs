@@ -5,10 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{
-    camera,
-    error::{Error, Result},
-};
+use crate::error::{Error, Result};
 
 /// Which branch of a local generator carries the residual distance head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -122,7 +119,7 @@ pub struct FieldConfig {
     pub density: DensityKind,
     /// The global distance.
     pub initial_distance: InitialDistance,
-    /// World units per unit of the residual head's output. Authors 1; ours [`camera::INPUT_SCALE`]'s inverse.
+    /// World units per unit of the residual head's output. Authors 1; ours 0.12, half the depth of the volume.
     pub residual_scale: f64,
     /// Start of the learnt α, world units (paper: 0.1).
     pub alpha_initial: f64,
@@ -159,8 +156,8 @@ impl FieldConfig {
             background: Background::FarPlane,
             mask_view_input: false,
             feature_view_input: false,
-            residual_scale: 1.0 / camera::INPUT_SCALE,
-            alpha_initial: 0.1 / camera::INPUT_SCALE,
+            residual_scale: 0.12,
+            alpha_initial: 0.012,
             ..Self::paper()
         }
     }

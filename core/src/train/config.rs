@@ -1,0 +1,491 @@
+//! What a training run does. Every number is a field with its source; presets set them together; `--set a.b=c`
+//! changes one. The resolved configuration is saved beside every run and read back by `--resume`.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    config::{FieldConfig, GeneratorConfig, UpsamplerConfig},
+    error::{Error, Result},
+    train::optimiser::Schedule,
+};
+
+/// The stages of training, in order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// Posed reconstruction of the training portraits, a code each (ours; a start the paper does not have).
+    Warmup,
+    /// The paper's first stage: the field against the global and the semantic discriminator.
+    Field,
+    /// The paper's second stage: the upsampler, the field frozen.
+    Upsampler,
+    /// All of the above that the preset asks for, one after the other.
+    All,
+}
+
+/// Sets of settings that belong together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// Procedural cartoon portraits, CPU-sized.
+    Cartoon,
+    /// A few hundred real portraits, CPU-sized.
+    Portrait,
+    /// The paper's sizes and rates.
+    Ffhq,
+    /// Seconds; for tests.
+    Tiny,
+}
+
+/// A whole run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// The preset the values started from.
+    pub preset: Preset,
+    /// Seed of every draw.
+    pub seed: u64,
+    /// Mirrored copies of all portraits are used too.
+    pub mirror: bool,
+    /// Steps between checkpoints.
+    pub checkpoint_steps: usize,
+    /// Steps between sample grids.
+    pub sample_steps: usize,
+    /// Steps between lines of the log.
+    pub log_steps: usize,
+    /// What is trained.
+    pub model: GeneratorConfig,
+    /// Stage `warmup`.
+    pub warmup: WarmupConfig,
+    /// Stage `field`.
+    pub field: FieldStageConfig,
+    /// Stage `upsampler`.
+    pub upsampler: UpsamplerStageConfig,
+}
+
+/// The posed reconstruction warm-up (shared/recipe: every default is the recipe's unless said otherwise).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WarmupConfig {
+    /// Optimiser steps; the recipe's nine minutes were 2,147.
+    pub steps: usize,
+    /// Portraits a step.
+    pub batch: usize,
+    /// Rays a portrait.
+    pub rays: usize,
+    /// Samples a ray.
+    pub samples: usize,
+    /// Depths between which samples are placed.
+    pub depth_range: [f64; 2],
+    /// Learning rate of field, FiLM and mapping.
+    pub learning_rate: f64,
+    /// Learning rate of the portraits' codes.
+    pub code_learning_rate: f64,
+    /// Schedule of both.
+    pub schedule: Schedule,
+    /// Adam's β.
+    pub betas: [f64; 2],
+    /// Largest gradient norm of the field.
+    pub gradient_bound: f64,
+    /// α at the start and at the end, world units, moved exponentially over `alpha_hold` of the run.
+    pub alpha: [f64; 2],
+    /// Fraction of the run after which α stays.
+    pub alpha_hold: f64,
+    /// Resolution of the first and of the second part of the run, pixels.
+    pub resolutions: [usize; 2],
+    /// Fraction of the run at the first resolution.
+    pub first_resolution_share: f64,
+    /// Extra weight of eyes, eyebrows, mouth, nose and ears when pixels are drawn.
+    pub detail_boost: f64,
+    /// Rays start up to this far from their pixel's centre, pixels.
+    pub pixel_jitter: f64,
+    /// Loss weights.
+    pub weights: WarmupWeights,
+    /// Share of the points at which the eikonal loss is taken.
+    pub eikonal_share: f64,
+}
+
+/// Weights of the warm-up's losses (recipe).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WarmupWeights {
+    /// L1 of colours in [0, 1].
+    pub colour: f64,
+    /// Squared error of rendered masks.
+    pub masks: f64,
+    /// Cross-entropy of opacity against "not background".
+    pub opacity: f64,
+    /// (|∇d| - 1)².
+    pub eikonal: f64,
+    /// exp(-100 |d|).
+    pub minimal_surface: f64,
+    /// A region's colour outside its mask is pulled to its mean colour.
+    pub fill: f64,
+    /// Mean square of the codes.
+    pub code_norm: f64,
+}
+
+/// The paper's first stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldStageConfig {
+    /// Optimiser steps of each player.
+    pub steps: usize,
+    /// Portraits a step.
+    pub batch: usize,
+    /// Resolution of renders and of the real pictures, pixels. Paper: 64.
+    pub resolution: usize,
+    /// Samples a ray. Paper: 24.
+    pub samples: usize,
+    /// Generator's learning rate. Paper: 2e-5.
+    pub generator_learning_rate: f64,
+    /// Discriminators' learning rate. Paper: 2e-4.
+    pub discriminator_learning_rate: f64,
+    /// Adam's β. Paper: 0, 0.9.
+    pub betas: [f64; 2],
+    /// Channels of the discriminators relative to the authors' tables.
+    pub channel_multiplier: f64,
+    /// Factor on |∇D|² of the image. Authors: 10, halved in the sum.
+    pub r1_image: f64,
+    /// Factor on |∇D|² of the mask. Authors: 1000, halved in the sum.
+    pub r1_mask: f64,
+    /// λ_view of smooth L1 between predicted and true camera angles. Paper: 15.
+    pub view: f64,
+    /// λ_Eik. Paper: 0.1.
+    pub eikonal: f64,
+    /// λ_MS. Paper: 0.001.
+    pub minimal_surface: f64,
+    /// Weight of the semantic discriminator's adversarial and class terms. Paper: 1; 0 trains without it.
+    pub semantic: f64,
+    /// Weight of L_STD. Paper: 1; 0 trains without it.
+    pub decoupling: f64,
+    /// Margin m of L_STD. The paper gives no number; ours 0.1, about a tenth of two portraits' feature distance.
+    pub decoupling_margin: f64,
+    /// Chance that a step mixes two codes. StyleGAN: 0.9.
+    pub mixing: f64,
+    /// Decay of the averaged weights a 10,000 images halve: 0.5^(batch / half_life).
+    pub average_half_life_images: f64,
+}
+
+/// The upsampler's stage: paired reconstruction (recipe) and, from `adversarial` > 0, the paper's second stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UpsamplerStageConfig {
+    /// Optimiser steps; the recipe's 4.2 minutes were 1,347.
+    pub steps: usize,
+    /// Portraits a step.
+    pub batch: usize,
+    /// Side of the crops, pixels of the render; the whole render if it is as large. Recipe: 48 of 64.
+    pub crop: usize,
+    /// Learning rate. Recipe: 2e-3; paper: StyleGAN2's 2e-3.
+    pub learning_rate: f64,
+    /// Learning rate of the high-resolution discriminator. StyleGAN2: 2e-3.
+    pub discriminator_learning_rate: f64,
+    /// Schedule of the upsampler's rate.
+    pub schedule: Schedule,
+    /// Adam's β. Recipe: 0.9, 0.99; paper: 0, 0.99.
+    pub betas: [f64; 2],
+    /// Weight of L1 against the portrait the code belongs to (needs a warmed-up model's codes).
+    pub pixels: f64,
+    /// Weight of LPIPS against it (needs `--lpips`).
+    pub perceptual: f64,
+    /// Weight of the non-saturating adversarial loss.
+    pub adversarial: f64,
+    /// Channels of the discriminator relative to the authors' tables.
+    pub channel_multiplier: f64,
+    /// As in the field's stage.
+    pub r1_image: f64,
+    /// As in the field's stage.
+    pub r1_mask: f64,
+    /// Steps between R1 penalties. Authors: 16.
+    pub r1_steps: usize,
+    /// Weight of the path-length penalty; 0 leaves it out. StyleGAN2: 2.
+    pub path_length: f64,
+    /// Steps between path-length penalties. Authors: 4.
+    pub path_length_steps: usize,
+    /// As in the field's stage.
+    pub average_half_life_images: f64,
+}
+
+impl TrainConfig {
+    /// The settings of a preset.
+    pub fn preset(preset: Preset) -> Self {
+        match preset {
+            Preset::Portrait => Self::small(preset, [0.3, 0.15]),
+            Preset::Cartoon => Self::small(preset, [0.4, 0.2]),
+            Preset::Ffhq => Self::paper(),
+            Preset::Tiny => Self::tiny(),
+        }
+    }
+
+    fn small(preset: Preset, camera_deviation_rad: [f64; 2]) -> Self {
+        let field = FieldConfig::ours();
+        let upsampler = Some(UpsamplerConfig::ours(field.style_dim));
+        Self {
+            preset,
+            seed: 0,
+            mirror: true,
+            checkpoint_steps: 500,
+            sample_steps: 500,
+            log_steps: 20,
+            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 24 },
+            warmup: WarmupConfig {
+                steps: 4_000,
+                batch: 32,
+                rays: 48,
+                samples: 10,
+                depth_range: [0.895, 1.10],
+                learning_rate: 1e-3,
+                code_learning_rate: 3e-3,
+                schedule: Schedule { warmup_steps: 100, hold: 0.3, floor: 0.03 },
+                betas: [0.9, 0.99],
+                gradient_bound: 1.0,
+                alpha: [0.012, 0.0024],
+                alpha_hold: 0.7,
+                resolutions: [32, 64],
+                first_resolution_share: 0.4,
+                detail_boost: 2.0,
+                pixel_jitter: 0.25,
+                weights: WarmupWeights {
+                    colour: 1.0,
+                    masks: 1.0,
+                    opacity: 0.1,
+                    eikonal: 0.05,
+                    minimal_surface: 0.001,
+                    fill: 0.1,
+                    code_norm: 1e-3,
+                },
+                eikonal_share: 1.0 / 6.0,
+            },
+            field: FieldStageConfig {
+                steps: 0,
+                batch: 8,
+                resolution: 32,
+                samples: 12,
+                generator_learning_rate: 1e-4,
+                discriminator_learning_rate: 1e-3,
+                channel_multiplier: 0.125,
+                ..Self::paper_field_stage()
+            },
+            upsampler: UpsamplerStageConfig {
+                steps: 3_000,
+                batch: 8,
+                crop: 48,
+                learning_rate: 2e-3,
+                discriminator_learning_rate: 1e-3,
+                schedule: Schedule { warmup_steps: 50, hold: 0.4, floor: 0.05 },
+                betas: [0.9, 0.99],
+                pixels: 1.0,
+                perceptual: 1.0,
+                adversarial: 0.0,
+                channel_multiplier: 0.125,
+                path_length: 0.0,
+                average_half_life_images: 1_000.0,
+                ..Self::paper_upsampler_stage()
+            },
+        }
+    }
+
+    fn paper() -> Self {
+        let field = FieldConfig::paper();
+        let upsampler = Some(UpsamplerConfig::paper(field.style_dim));
+        let small = Self::small(Preset::Ffhq, [0.3, 0.15]);
+        Self {
+            model: GeneratorConfig { field, upsampler, camera_deviation_rad: [0.3, 0.15], samples: 24 },
+            warmup: WarmupConfig { steps: 0, ..small.warmup.clone() },
+            field: Self::paper_field_stage(),
+            upsampler: Self::paper_upsampler_stage(),
+            checkpoint_steps: 2_000,
+            sample_steps: 2_000,
+            ..small
+        }
+    }
+
+    fn paper_field_stage() -> FieldStageConfig {
+        FieldStageConfig {
+            steps: 300_000,
+            batch: 24,
+            resolution: 64,
+            samples: 24,
+            generator_learning_rate: 2e-5,
+            discriminator_learning_rate: 2e-4,
+            betas: [0.0, 0.9],
+            channel_multiplier: 1.0,
+            r1_image: 10.0,
+            r1_mask: 1_000.0,
+            view: 15.0,
+            eikonal: 0.1,
+            minimal_surface: 0.001,
+            semantic: 1.0,
+            decoupling: 1.0,
+            decoupling_margin: 0.1,
+            mixing: 0.9,
+            average_half_life_images: 10_000.0,
+        }
+    }
+
+    fn paper_upsampler_stage() -> UpsamplerStageConfig {
+        UpsamplerStageConfig {
+            steps: 300_000,
+            batch: 16,
+            crop: 64,
+            learning_rate: 2e-3,
+            discriminator_learning_rate: 2e-3,
+            schedule: Schedule { warmup_steps: 1, hold: 1.0, floor: 1.0 },
+            betas: [0.0, 0.99],
+            pixels: 0.0,
+            perceptual: 0.0,
+            adversarial: 1.0,
+            channel_multiplier: 1.0,
+            r1_image: 10.0,
+            r1_mask: 1_000.0,
+            r1_steps: 16,
+            path_length: 2.0,
+            path_length_steps: 4,
+            average_half_life_images: 10_000.0,
+        }
+    }
+
+    fn tiny() -> Self {
+        let small = Self::small(Preset::Tiny, [0.4, 0.2]);
+        let field = FieldConfig { style_dim: 16, width: 16, ..FieldConfig::ours() };
+        let upsampler = UpsamplerConfig {
+            input_resolution: 16,
+            output_resolution: 32,
+            channels: vec![8, 8],
+            blocks: vec![1, 1],
+            ..UpsamplerConfig::ours(16)
+        };
+        Self {
+            checkpoint_steps: 20,
+            sample_steps: 40,
+            log_steps: 5,
+            model: GeneratorConfig { field, upsampler: Some(upsampler), samples: 10, ..small.model },
+            warmup: WarmupConfig {
+                steps: 120,
+                batch: 8,
+                rays: 32,
+                resolutions: [16, 16],
+                learning_rate: 2e-3,
+                code_learning_rate: 1e-2,
+                schedule: Schedule { warmup_steps: 10, hold: 0.3, floor: 0.05 },
+                ..small.warmup
+            },
+            field: FieldStageConfig {
+                steps: 6,
+                batch: 2,
+                resolution: 16,
+                samples: 6,
+                channel_multiplier: 0.03125,
+                ..small.field
+            },
+            upsampler: UpsamplerStageConfig { steps: 30, batch: 4, crop: 16, perceptual: 0.0, ..small.upsampler },
+            ..small
+        }
+    }
+
+    /// Refuses what cannot be trained.
+    pub fn validate(&self) -> Result<()> {
+        self.model.field.validate()?;
+        let positive = |option: &str, value: usize| {
+            if value == 0 { Err(Error::config(option, "must be at least 1")) } else { Ok(()) }
+        };
+        positive("warmup.batch", self.warmup.batch)?;
+        positive("warmup.rays", self.warmup.rays)?;
+        positive("warmup.samples", self.warmup.samples)?;
+        positive("field.batch", self.field.batch)?;
+        positive("field.samples", self.field.samples)?;
+        positive("upsampler.batch", self.upsampler.batch)?;
+        positive("upsampler.crop", self.upsampler.crop)?;
+        positive("checkpoint_steps", self.checkpoint_steps)?;
+        positive("sample_steps", self.sample_steps)?;
+        positive("log_steps", self.log_steps)?;
+        if self.warmup.rays > self.warmup.resolutions[0] * self.warmup.resolutions[0] {
+            return Err(Error::config("warmup.rays", "more rays than the first resolution has pixels"));
+        }
+        Ok(())
+    }
+
+    /// The configuration with `assignments` such as `warmup.steps=100` applied. A name that does not exist, or a value
+    /// of another type, is an error that names it.
+    pub fn with(&self, assignments: &[String]) -> Result<Self> {
+        let mut tree = toml::Value::try_from(self).map_err(|error| Error::config("--set", error))?;
+        for assignment in assignments {
+            let (path, value) = assignment
+                .split_once('=')
+                .ok_or_else(|| Error::config("--set", format!("`{assignment}` is not of the form key=value")))?;
+            let mut place = &mut tree;
+            for key in path.trim().split('.') {
+                let table = place.as_table_mut();
+                let known = table.as_ref().map(|table| table.keys().cloned().collect::<Vec<_>>()).unwrap_or_default();
+                place = table.and_then(|table| table.get_mut(key)).ok_or_else(|| {
+                    Error::config(
+                        format!("--set {path}"),
+                        format!("there is no `{key}` here; known: {}", known.join(", ")),
+                    )
+                })?;
+            }
+            let parsed: toml::Table = toml::from_str(&format!("value = {value}"))
+                .or_else(|_| toml::from_str(&format!("value = {value:?}")))
+                .map_err(|error| Error::config(format!("--set {path}"), error.message()))?;
+            let parsed = parsed.get("value").cloned().unwrap_or(toml::Value::Boolean(false));
+            // Whole numbers may be written where a real one is meant.
+            *place = match (&*place, parsed) {
+                (toml::Value::Float(_), toml::Value::Integer(whole)) => toml::Value::Float(whole as f64),
+                (_, parsed) => parsed,
+            };
+        }
+        let config: Self = tree.try_into().map_err(|error: toml::de::Error| Error::config("--set", error.message()))?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// TOML text; [`Self::from_toml`] reads it back.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string_pretty(self).map_err(|error| Error::config("config.toml", error))
+    }
+
+    /// Reads TOML text; unknown keys are errors.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let config: Self = toml::from_str(text).map_err(|error| Error::config("config.toml", error.message()))?;
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_is_valid_and_round_trips() {
+        for preset in [Preset::Cartoon, Preset::Portrait, Preset::Ffhq, Preset::Tiny] {
+            let config = TrainConfig::preset(preset);
+            config.validate().unwrap();
+            assert_eq!(TrainConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
+        }
+    }
+
+    #[test]
+    fn overrides_apply_and_typos_are_named() {
+        let config = TrainConfig::preset(Preset::Tiny);
+        let changed = config.with(&["warmup.steps=7".into(), "warmup.weights.fill=1".into()]).unwrap();
+        assert_eq!((changed.warmup.steps, changed.warmup.weights.fill), (7, 1.0));
+        let message = |assignment: &str| config.with(&[assignment.into()]).unwrap_err().to_string();
+        assert!(message("warmup.stepps=7").contains("no `stepps`"));
+        assert!(message("warmup.steps=x").contains("--set"));
+        assert!(message("warmup.steps").contains("key=value"));
+    }
+
+    #[test]
+    fn the_paper_preset_has_the_papers_numbers() {
+        let config = TrainConfig::preset(Preset::Ffhq);
+        let (field, stage) = (&config.model.field, &config.field);
+        assert_eq!((field.width, field.style_dim, stage.samples, stage.resolution), (128, 256, 24, 64));
+        assert_eq!((stage.generator_learning_rate, stage.discriminator_learning_rate), (2e-5, 2e-4));
+        assert_eq!((stage.betas, stage.view, stage.eikonal, stage.minimal_surface), ([0.0, 0.9], 15.0, 0.1, 0.001));
+        assert_eq!(config.model.upsampler.as_ref().map(|u| u.output_resolution), Some(512));
+    }
+}
