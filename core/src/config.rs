@@ -226,6 +226,9 @@ pub struct UpsamplerConfig {
     pub latent_dim: usize,
     /// Residual blocks at each resolution (`Residual` only; recipe 3 at 64, 2 at 128).
     pub blocks: Vec<usize>,
+    /// Whether the render's normals are among its inputs (`Residual` only; recipe: yes).
+    #[serde(default)]
+    pub normal_input: bool,
 }
 
 impl UpsamplerConfig {
@@ -240,6 +243,7 @@ impl UpsamplerConfig {
             style_layers: 0,
             latent_dim: style_dim,
             blocks: vec![3, 2],
+            normal_input: true,
         }
     }
 
@@ -254,6 +258,7 @@ impl UpsamplerConfig {
             style_layers: 5,
             latent_dim: 2 * style_dim,
             blocks: Vec::new(),
+            normal_input: false,
         }
     }
 }
