@@ -24,6 +24,8 @@ pub enum Init {
     Uniform(f64),
     /// Normal with this standard deviation.
     Normal(f64),
+    /// Ones on the diagonal of the last two dimensions, zeros elsewhere.
+    Identity,
 }
 
 struct Store {
@@ -144,5 +146,13 @@ fn draw(seed: u64, name: &str, shape: &[usize], init: Init, device: &Device) -> 
         Init::Constant(value) => Tensor::full(value as f32, shape, device)?,
         Init::Uniform(bound) => random.uniform_tensor(shape, -bound as f32, bound as f32, device)?,
         Init::Normal(deviation) => (random.normal_tensor(shape, device)? * deviation)?,
+        Init::Identity => match *shape {
+            [.., rows, columns] => {
+                let diagonal = |index| ((index / columns) % rows == index % columns) as u8 as f32;
+                let values: Vec<f32> = (0..shape.iter().product()).map(diagonal).collect();
+                Tensor::from_vec(values, shape, device)?
+            }
+            _ => return Err(Error::shape(name, "[.., rows, columns]", shape)),
+        },
     })
 }
