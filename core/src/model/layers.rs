@@ -192,6 +192,31 @@ pub fn pixel_norm(input: &Tensor) -> Result<Tensor> {
     Ok(input.broadcast_div(&root)?)
 }
 
+/// StyleGAN2's unmodulated convolution with equalised learning rate, a bias, and leaky ReLU × √2.
+#[derive(Clone, Debug)]
+pub struct EqualConvolution {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl EqualConvolution {
+    /// A `kernel`² convolution that keeps the picture's size (`kernel` odd).
+    pub fn new(inputs: usize, outputs: usize, kernel: usize, parameters: &Parameters) -> Result<Self> {
+        Ok(Self {
+            weight: parameters.get("weight", &[outputs, inputs, kernel, kernel], Init::Normal(1.0))?,
+            bias: parameters.get("bias", &[outputs], Init::Constant(0.0))?,
+        })
+    }
+
+    /// `[B, I, h, w]` → `[B, O, h, w]`.
+    pub fn forward(&self, input: &Tensor) -> Result<Tensor> {
+        let (_, inputs, kernel, _) = self.weight.dims4()?;
+        let weight = (&self.weight / ((inputs * kernel * kernel) as f64).sqrt())?;
+        let output = add_bias(&convolve(input, &weight, 1, kernel / 2)?, &self.bias)?;
+        Ok((leaky_relu(&output)? * std::f64::consts::SQRT_2)?)
+    }
+}
+
 /// StyleGAN2's linear layer with equalised learning rate: the stored weight is scaled at run time.
 #[derive(Clone, Debug)]
 pub struct EqualLinear {

@@ -3,10 +3,11 @@
 //! by one global code or, per pixel, by the codes of the regions that own the pixel.
 
 pub mod residual;
+pub mod stylegan2;
 
 use candle_core::Tensor;
 
-use self::residual::ResidualUpsampler;
+use self::{residual::ResidualUpsampler, stylegan2::StyleGan2Upsampler};
 use crate::{
     config::{UpsamplerConfig, UpsamplerKind, UpsamplerStyle},
     error::{Error, Result},
@@ -57,6 +58,8 @@ pub enum Noise<'a> {
 pub enum Upsampler {
     /// See [`residual`].
     Residual(ResidualUpsampler),
+    /// See [`stylegan2`].
+    StyleGan2(StyleGan2Upsampler),
 }
 
 impl Upsampler {
@@ -71,20 +74,22 @@ impl Upsampler {
         parameters: &Parameters,
     ) -> Result<Self> {
         validate(config, style_dim)?;
-        match config.kind {
+        Ok(match config.kind {
             UpsamplerKind::Residual => {
-                Ok(Self::Residual(ResidualUpsampler::new(config, field_feature_dim, style_dim, parameters)?))
+                Self::Residual(ResidualUpsampler::new(config, field_feature_dim, style_dim, parameters)?)
             }
-            UpsamplerKind::StyleGan2 => Err(Error::config("upsampler.kind", "stylegan2 not landed yet")),
-        }
+            UpsamplerKind::StyleGan2 => {
+                Self::StyleGan2(StyleGan2Upsampler::new(config, field_feature_dim, style_dim, parameters)?)
+            }
+        })
     }
 
     /// Lifts a render. `style` is either one code per picture, `[B, style_dim]`, or, with
     /// [`UpsamplerStyle::PerRegion`], the codes of all regions, `[B, 9, 2, style_dim]`, of which the texture rows act.
     pub fn forward(&self, input: &UpsamplerInput, style: &Tensor, noise: Noise<'_>) -> Result<UpsamplerOutput> {
-        let _ = noise;
         match self {
             Self::Residual(network) => network.forward(input, style),
+            Self::StyleGan2(network) => network.synthesize(input, &network.latents(style)?, noise),
         }
     }
 }
@@ -185,7 +190,9 @@ pub(crate) mod tests {
         let gradients = loss().backward().unwrap();
         let value = || loss().to_scalar::<f64>().unwrap();
         let mut checked = 0;
-        for (index, (name, variable)) in parameters.variables().into_iter().enumerate() {
+        // Stored noise is a constant that files carry: it takes no gradient by intent.
+        let trained = parameters.variables().into_iter().filter(|(name, _)| !name.ends_with(".noise"));
+        for (index, (name, variable)) in trained.enumerate() {
             let direction = random(1000 + index as u64, variable.dims());
             let start = variable.as_tensor().copy().unwrap();
             let moved = |step: f64| {
