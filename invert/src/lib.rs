@@ -2,8 +2,11 @@
 //! generator around them, keep it all in one portrait file, and edit that.
 
 pub mod align;
+pub mod config;
 pub mod detect;
+pub mod edit;
 pub mod error;
 pub mod photo;
+pub mod portrait;
 
 pub use error::{Error, Result};
