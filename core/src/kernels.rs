@@ -15,6 +15,7 @@ use crate::{
 
 pub mod autograd;
 pub mod composed;
+pub mod conv;
 pub mod fused;
 pub mod plain;
 pub mod simd;

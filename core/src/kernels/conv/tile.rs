@@ -1,0 +1,283 @@
+//! The inner product under every convolution: a few rows of one operand, a few vectors of the other, all sums in
+//! registers. Written once over [`Vector`] and compiled for each instruction set that [`on`] can choose.
+
+use super::InstructionSet;
+
+/// Most rows that one product holds in registers.
+pub(super) const MOST_ROWS: usize = 8;
+/// Most vectors that one product holds in registers, beside each other.
+pub(super) const MOST_VECTORS: usize = 3;
+
+/// A register of f32 lanes.
+///
+/// The methods are `inline(always)`, so a generic kernel called from a function with a `target_feature` becomes code
+/// for that instruction set.
+pub(super) trait Vector: Copy {
+    /// Values in one register.
+    const LANES: usize;
+    /// Rows of a full product: as many as leave the register file room for the operands.
+    const ROWS: usize;
+
+    /// All lanes `value`.
+    ///
+    /// # Safety
+    /// The processor has this type's instruction set.
+    unsafe fn splat(value: f32) -> Self;
+
+    /// The `LANES` values at `from`, at any alignment.
+    ///
+    /// # Safety
+    /// The processor has this type's instruction set and `from` is readable for `LANES` values.
+    unsafe fn load(from: *const f32) -> Self;
+
+    /// Writes the lanes to `to`, at any alignment.
+    ///
+    /// # Safety
+    /// The processor has this type's instruction set and `to` is writable for `LANES` values.
+    unsafe fn store(self, to: *mut f32);
+
+    /// `self · factor + addend`.
+    ///
+    /// # Safety
+    /// The processor has this type's instruction set.
+    unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self;
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::*;
+
+    impl super::Vector for __m512 {
+        const LANES: usize = 16;
+        const ROWS: usize = 8;
+
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> Self {
+            // SAFETY: the caller vouches for AVX-512F.
+            unsafe { _mm512_set1_ps(value) }
+        }
+
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> Self {
+            // SAFETY: the caller vouches for AVX-512F and for 16 readable values.
+            unsafe { _mm512_loadu_ps(from) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(self, to: *mut f32) {
+            // SAFETY: the caller vouches for AVX-512F and for 16 writable values.
+            unsafe { _mm512_storeu_ps(to, self) }
+        }
+
+        #[inline(always)]
+        unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
+            // SAFETY: the caller vouches for AVX-512F.
+            unsafe { _mm512_fmadd_ps(self, factor, addend) }
+        }
+    }
+
+    impl super::Vector for __m256 {
+        const LANES: usize = 8;
+        const ROWS: usize = 4;
+
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> Self {
+            // SAFETY: the caller vouches for AVX.
+            unsafe { _mm256_set1_ps(value) }
+        }
+
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> Self {
+            // SAFETY: the caller vouches for AVX and for 8 readable values.
+            unsafe { _mm256_loadu_ps(from) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(self, to: *mut f32) {
+            // SAFETY: the caller vouches for AVX and for 8 writable values.
+            unsafe { _mm256_storeu_ps(to, self) }
+        }
+
+        #[inline(always)]
+        unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
+            // SAFETY: the caller vouches for FMA.
+            unsafe { _mm256_fmadd_ps(self, factor, addend) }
+        }
+    }
+}
+
+/// Four lanes in plain Rust, which compilers turn into NEON, SSE2 or WebAssembly vectors.
+#[derive(Clone, Copy)]
+pub(super) struct FourLanes([f32; 4]);
+
+impl Vector for FourLanes {
+    const LANES: usize = 4;
+    const ROWS: usize = 4;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self {
+        Self([value; 4])
+    }
+
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self {
+        // SAFETY: the caller vouches for 4 readable values; an array of f32 has f32's alignment.
+        Self(unsafe { from.cast::<[f32; 4]>().read() })
+    }
+
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        // SAFETY: the caller vouches for 4 writable values; an array of f32 has f32's alignment.
+        unsafe { to.cast::<[f32; 4]>().write(self.0) }
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
+        let mut sum = addend.0;
+        for ((sum, a), b) in sum.iter_mut().zip(self.0).zip(factor.0) {
+            // Where the processor has no fused form, `mul_add` would be a call into the C library.
+            *sum = if cfg!(target_arch = "aarch64") { a.mul_add(b, *sum) } else { a * b + *sum };
+        }
+        Self(sum)
+    }
+}
+
+/// Work to be compiled once for each instruction set. Implementations must be `inline(always)`, and must not call
+/// closures: neither a plain call nor a closure inherits the instruction set.
+pub(super) trait Job {
+    /// Does the work with registers of type `V`.
+    ///
+    /// # Safety
+    /// The processor has `V`'s instruction set.
+    unsafe fn run<V: Vector>(self);
+}
+
+/// Runs `job` with the registers of `instruction_set`, which must be one this processor has
+/// ([`InstructionSet::available`]); anything else falls back to [`FourLanes`].
+pub(super) fn on<J: Job>(instruction_set: InstructionSet, job: J) {
+    match instruction_set {
+        #[cfg(target_arch = "x86_64")]
+        InstructionSet::Avx512 if InstructionSet::Avx512.available() => {
+            // SAFETY: the processor was just asked.
+            unsafe { with_avx512(job) }
+        }
+        #[cfg(target_arch = "x86_64")]
+        InstructionSet::Avx2 if InstructionSet::Avx2.available() => {
+            // SAFETY: the processor was just asked.
+            unsafe { with_avx2(job) }
+        }
+        // SAFETY: plain Rust, no instruction set needed.
+        _ => unsafe { job.run::<FourLanes>() },
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn with_avx512<J: Job>(job: J) {
+    // SAFETY: this function can only be reached on processors with AVX-512F.
+    unsafe { job.run::<std::arch::x86_64::__m512>() }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn with_avx2<J: Job>(job: J) {
+    // SAFETY: this function can only be reached on processors with AVX2 and FMA.
+    unsafe { job.run::<std::arch::x86_64::__m256>() }
+}
+
+/// One small product: `out[m][n] (+)= Σ_r Σ_k rows[m][r·row_step + k] · columns[r·column_step + offsets[k] + n]`.
+pub(super) struct Product<'a> {
+    /// Where each row starts.
+    pub rows: [*const f32; MOST_ROWS],
+    /// How far every row moves from one repetition to the next.
+    pub row_step: usize,
+    /// Where the vectors start.
+    pub columns: *const f32,
+    /// How far the vectors move from one repetition to the next.
+    pub column_step: usize,
+    /// Where the vectors of each summand are, from `columns` on.
+    pub offsets: &'a [u32],
+    /// Number of repetitions (the sum over r).
+    pub repetitions: usize,
+    /// Row-major sums, `out_stride` values from row to row.
+    pub out: *mut f32,
+    /// Distance of two rows of `out`.
+    pub out_stride: usize,
+    /// Whether `out` holds earlier summands to add to; else it is overwritten.
+    pub accumulate: bool,
+}
+
+/// The height of the product that treats `left` remaining rows: a full one while there are enough.
+/// Surplus rows of a product must point at readable values; their sums are computed and ignored.
+#[inline(always)]
+pub(super) fn rows_of_next<V: Vector>(left: usize) -> usize {
+    match left {
+        1 => 1,
+        2..=4 => 4,
+        _ => V::ROWS,
+    }
+}
+
+/// Computes `product` for `rows` rows (from [`rows_of_next`]) and `vectors` vectors (1 to [`MOST_VECTORS`]).
+///
+/// # Safety
+/// The processor has `V`'s instruction set; every address that the formula of [`Product`] names is readable, and
+/// `out` is writable, for `rows` rows and `vectors · LANES` columns.
+#[inline(always)]
+pub(super) unsafe fn multiply<V: Vector>(rows: usize, vectors: usize, product: &Product<'_>) {
+    // SAFETY: the caller's promise covers every shape up to (rows, vectors), and each arm computes exactly that one.
+    unsafe {
+        match (rows, vectors) {
+            (8, 3) if V::ROWS == 8 => tile::<V, 8, 3>(product),
+            (8, 2) if V::ROWS == 8 => tile::<V, 8, 2>(product),
+            (8, _) if V::ROWS == 8 => tile::<V, 8, 1>(product),
+            (4, 3) => tile::<V, 4, 3>(product),
+            (4, 2) => tile::<V, 4, 2>(product),
+            (4, _) => tile::<V, 4, 1>(product),
+            (_, 3) => tile::<V, 1, 3>(product),
+            (_, 2) => tile::<V, 1, 2>(product),
+            (_, _) => tile::<V, 1, 1>(product),
+        }
+    }
+}
+
+/// [`multiply`] at a fixed shape, all sums in registers.
+#[inline(always)]
+unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Product<'_>) {
+    // SAFETY: the caller of `multiply` vouches for every address below.
+    unsafe {
+        let mut sums = [[V::splat(0.0); VECTORS]; ROWS];
+        if product.accumulate {
+            for (m, row) in sums.iter_mut().enumerate() {
+                for (n, sum) in row.iter_mut().enumerate() {
+                    *sum = V::load(product.out.add(m * product.out_stride + n * V::LANES));
+                }
+            }
+        }
+        for repetition in 0..product.repetitions {
+            let columns = product.columns.add(repetition * product.column_step);
+            let mut rows = [product.rows[0]; ROWS];
+            for (row, start) in rows.iter_mut().zip(product.rows) {
+                *row = start.add(repetition * product.row_step);
+            }
+            for (k, &offset) in product.offsets.iter().enumerate() {
+                let from = columns.add(offset as usize);
+                let mut factors = [V::splat(0.0); VECTORS];
+                for (n, factor) in factors.iter_mut().enumerate() {
+                    *factor = V::load(from.add(n * V::LANES));
+                }
+                for (row, sums) in rows.iter().zip(sums.iter_mut()) {
+                    let weight = V::splat(*row.add(k));
+                    for (sum, factor) in sums.iter_mut().zip(factors) {
+                        *sum = weight.multiply_add(factor, *sum);
+                    }
+                }
+            }
+        }
+        for (m, row) in sums.iter().enumerate() {
+            for (n, sum) in row.iter().enumerate() {
+                sum.store(product.out.add(m * product.out_stride + n * V::LANES));
+            }
+        }
+    }
+}

@@ -1,0 +1,212 @@
+//! The adjoint of a convolution in its weight: a sum over all positions of all images. Output channels lie along the
+//! vectors, so that a value of the input is broadcast exactly like a weight is in the forward pass.
+//!
+//! Tasks share out input and output channels, never the positions: each sum runs through the whole batch in one
+//! order, whatever the number of threads.
+
+use std::cell::RefCell;
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::InstructionSet;
+use super::direct::SharedOutput;
+use super::geometry::{Geometry, PaddedSource};
+use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Vector};
+
+/// Positions summed between two visits to the sums in memory: their gradients, for three vectors of channels, fill
+/// most of a first-level cache.
+const STRIP_POSITIONS: usize = 192;
+
+/// `[O, C, kh, kw]`, row-major, from the input `[B, C, H, W]` and the gradient of the output `[B, O, Ho, Wo]`.
+pub(super) fn weight_gradient(
+    instruction_set: InstructionSet,
+    geometry: &Geometry,
+    input: &[f32],
+    grad_output: &[f32],
+) -> Vec<f32> {
+    let mut source = PaddedSource::of_input(geometry);
+    source.strip = (STRIP_POSITIONS / geometry.output_width).clamp(1, geometry.output_height);
+
+    // Output channels in chunks of one to three vectors, as equal as can be; then input channels, as needed to give
+    // every thread a share.
+    let lanes = instruction_set.lanes();
+    let vectors = geometry.output_channels.div_ceil(lanes);
+    let chunks = vectors.div_ceil(MOST_VECTORS);
+    let threads = rayon::current_num_threads();
+    let groups = threads.div_ceil(chunks).min(geometry.input_channels);
+    let group = geometry.input_channels.div_ceil(groups);
+    let groups = geometry.input_channels.div_ceil(group);
+
+    let size = geometry.weight_shape().iter().product();
+    let mut result = Vec::<f32>::with_capacity(size);
+    let shared = SharedOutput(result.as_mut_ptr());
+    (0..chunks * groups).into_par_iter().for_each(|task| {
+        let (chunk, group_index) = (task / groups, task % groups);
+        let output_channels = chunk * vectors / chunks * lanes..(chunk + 1) * vectors / chunks * lanes;
+        // Bound as a whole, so that the closure captures the wrapper and not the bare pointer in it.
+        let shared: SharedOutput = shared;
+        SCRATCH.with_borrow_mut(|scratch| {
+            let job = WeightJob {
+                geometry,
+                source: &source,
+                input,
+                grad_output,
+                input_channels: group_index * group..((group_index + 1) * group).min(geometry.input_channels),
+                output_channels: output_channels.start..output_channels.end.min(geometry.output_channels),
+                result: shared,
+                scratch,
+            };
+            tile::on(instruction_set, job);
+        });
+    });
+    // SAFETY: the capacity is at least this, and the tasks' (input, output) channels cover all weights.
+    unsafe { result.set_len(size) };
+    result
+}
+
+/// The gradients of the bias, `[O]`: sums of the output's gradient over images and positions.
+pub(super) fn bias_gradient(geometry: &Geometry, grad_output: &[f32]) -> Vec<f32> {
+    let positions = geometry.output_height * geometry.output_width;
+    let of_channel = |channel: usize| {
+        let mut sums = [0f32; 16];
+        let mut total = 0f64;
+        for image in 0..geometry.batch {
+            let values = &grad_output[image * geometry.output_size() + channel * positions..][..positions];
+            // Sixteen short sums side by side, gathered in f64 before they grow long enough to lose digits.
+            for block in values.chunks(4096) {
+                let vectors = block.chunks_exact(16);
+                total += vectors.remainder().iter().map(|&value| f64::from(value)).sum::<f64>();
+                for vector in vectors {
+                    for (sum, value) in sums.iter_mut().zip(vector) {
+                        *sum += value;
+                    }
+                }
+                total += sums.iter().map(|&sum| f64::from(sum)).sum::<f64>();
+                sums = [0.0; 16];
+            }
+        }
+        total as f32
+    };
+    (0..geometry.output_channels).into_par_iter().map(of_channel).collect()
+}
+
+/// Per-thread buffers that outlive a call.
+#[derive(Default)]
+struct Scratch {
+    strip: Vec<f32>,
+    gradients: Vec<f32>,
+    sums: Vec<f32>,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// The weight's gradient for some input and some output channels.
+struct WeightJob<'a> {
+    geometry: &'a Geometry,
+    source: &'a PaddedSource,
+    input: &'a [f32],
+    grad_output: &'a [f32],
+    input_channels: Range<usize>,
+    /// At most [`MOST_VECTORS`] vectors of them.
+    output_channels: Range<usize>,
+    result: SharedOutput,
+    scratch: &'a mut Scratch,
+}
+
+impl tile::Job for WeightJob<'_> {
+    #[inline(always)]
+    unsafe fn run<V: Vector>(self) {
+        let (geometry, source) = (self.geometry, self.source);
+        let vectors = self.output_channels.len().div_ceil(V::LANES);
+        let width = vectors * V::LANES;
+        let taps: Vec<usize> = (0..geometry.kernel_height)
+            .flat_map(|ky| (0..geometry.kernel_width).map(move |kx| source.offset(ky, kx)))
+            .collect();
+        let weights = self.input_channels.len() * taps.len();
+        // Where each weight meets the input at the strip's first position; the last one again to fill up a product.
+        let starts: Vec<usize> = (0..weights + MOST_ROWS)
+            .map(|weight| weight.min(weights - 1))
+            .map(|weight| weight / taps.len() * source.channel_size() + taps[weight % taps.len()])
+            .collect();
+        let offsets: Vec<u32> = (0..geometry.output_width).map(|x| (x * width) as u32).collect();
+
+        let Scratch { strip, gradients, sums } = self.scratch;
+        let strip_positions = source.strip * geometry.output_width;
+        gradients.clear();
+        gradients.resize(strip_positions * width, 0.0);
+        sums.clear();
+        sums.resize((weights + MOST_ROWS) * width, 0.0);
+
+        for image in 0..geometry.batch {
+            let input = &self.input[image * geometry.input_size()..][..geometry.input_size()];
+            let grad_output = &self.grad_output[image * geometry.output_size()..][..geometry.output_size()];
+            for index in 0..source.strips() {
+                let rows = source.rows_of_strip(index);
+                source.fill(input, self.input_channels.clone(), rows.clone(), 0, strip);
+                interleave(geometry, grad_output, &self.output_channels, &rows, width, gradients);
+                let mut weight = 0;
+                while weight < weights {
+                    let height = tile::rows_of_next::<V>(weights - weight);
+                    // SAFETY: `starts` has MOST_ROWS entries beyond `weights`, each of which stays inside the strip for
+                    // all positions of `rows`; gradients and sums were sized for these vectors just above; the caller
+                    // vouches for V.
+                    unsafe {
+                        let mut rows_of_product = [strip.as_ptr(); MOST_ROWS];
+                        for (m, row) in rows_of_product.iter_mut().enumerate() {
+                            *row = row.add(*starts.get_unchecked(weight + m));
+                        }
+                        let product = Product {
+                            rows: rows_of_product,
+                            row_step: source.pitch(),
+                            columns: gradients.as_ptr(),
+                            column_step: geometry.output_width * width,
+                            offsets: &offsets,
+                            repetitions: rows.len(),
+                            out: sums.as_mut_ptr().add(weight * width),
+                            out_stride: width,
+                            accumulate: true,
+                        };
+                        tile::multiply::<V>(height, vectors, &product);
+                    }
+                    weight += height;
+                }
+            }
+        }
+
+        let first = self.input_channels.start * taps.len();
+        for (column, channel) in self.output_channels.enumerate() {
+            let to = channel * geometry.input_channels * taps.len() + first;
+            for weight in 0..weights {
+                // SAFETY: inside [O, C·taps]; no other task has these input and output channels.
+                unsafe { *self.result.0.add(to + weight) = sums[weight * width + column] };
+            }
+        }
+    }
+}
+
+/// Lays the gradients of some channels and rows out as `[position, channel]`, `width` values per position.
+fn interleave(
+    geometry: &Geometry,
+    grad_output: &[f32],
+    channels: &Range<usize>,
+    rows: &Range<usize>,
+    width: usize,
+    to: &mut [f32],
+) {
+    let plane = geometry.output_height * geometry.output_width;
+    let positions = rows.len() * geometry.output_width;
+    let first = rows.start * geometry.output_width;
+    // Short runs of positions, so that what is being written stays in the first-level cache.
+    for run in (0..positions).step_by(16) {
+        let count = (positions - run).min(16);
+        for (column, channel) in channels.clone().enumerate() {
+            let from = &grad_output[channel * plane + first + run..][..count];
+            for (position, value) in to[run * width..].chunks_exact_mut(width).zip(from) {
+                position[column] = *value;
+            }
+        }
+    }
+}
