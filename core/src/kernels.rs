@@ -6,13 +6,15 @@
 //! [`RegionKernel`] the processor runs best. [`plain`] is the reference anybody can check, [`composed`] the same in
 //! candle operations for other devices, [`fused`] the fast one.
 
-use std::ops::Range;
+use std::{ops::Range, sync::OnceLock};
 
 use crate::{
     config::{FILM_LAYERS, SHAPE_LAYERS, SdfHead},
     error::{Error, Result},
 };
 
+#[cfg(test)]
+mod agreement;
 pub mod autograd;
 pub mod composed;
 pub mod conv;
@@ -201,6 +203,9 @@ impl<'a, T> Evaluation<'a, T> {
         film: &'a [T],
     ) -> Result<Self> {
         let Extent { images, regions, points: count } = extent;
+        if shape.width == 0 {
+            return Err(Error::config("field.width", "must be at least 1"));
+        }
         check_length("points", [images, count, shape.point_columns()].as_slice(), points.len())?;
         check_length("weights", [regions, shape.parameter_count()].as_slice(), weights.len())?;
         check_length("film", [images, regions, FILM_LAYERS, 2, shape.width].as_slice(), film.len())?;
@@ -258,6 +263,47 @@ pub trait RegionKernel<T>: Send + Sync {
     /// # Errors
     /// If a slice has another length or the processor cannot run this kernel.
     fn backward(&self, evaluation: &Evaluation<'_, T>, upstream: &[T], gradients: Gradients<'_, T>) -> Result<()>;
+}
+
+/// Every kernel, the fastest first; whether the processor can run one is for [`RegionKernel::available`] to say.
+pub fn kernels() -> impl Iterator<Item = &'static dyn RegionKernel<f32>> {
+    #[cfg(target_arch = "x86_64")]
+    let wide: [&dyn RegionKernel<f32>; 2] = [&fused::AVX512, &fused::AVX2];
+    #[cfg(not(target_arch = "x86_64"))]
+    let wide: [&dyn RegionKernel<f32>; 0] = [];
+    wide.into_iter().chain([&fused::PORTABLE as &dyn RegionKernel<f32>, &plain::Plain])
+}
+
+/// The kernel called `name`, or without a name the fastest that this processor can run.
+///
+/// # Errors
+/// If there is no such kernel here.
+pub fn select(name: Option<&str>) -> Result<&'static dyn RegionKernel<f32>> {
+    let mut candidates = kernels().filter(|kernel| kernel.available());
+    let Some(name) = name else {
+        return Ok(candidates.next().unwrap_or(&plain::Plain));
+    };
+    candidates.find(|kernel| kernel.name() == name).ok_or_else(|| {
+        let names: Vec<_> = kernels().filter(|kernel| kernel.available()).map(|kernel| kernel.name()).collect();
+        Error::config(KERNEL_VARIABLE, format!("no kernel `{name}` on this processor; use one of {}", names.join(", ")))
+    })
+}
+
+/// The environment variable that chooses a kernel by name.
+pub const KERNEL_VARIABLE: &str = "CNERF_KERNEL";
+
+/// The kernel that [`KERNEL_VARIABLE`] asks for, or the fastest; looked up once a process.
+///
+/// # Errors
+/// If the variable names no kernel of this processor.
+pub fn selected() -> Result<&'static dyn RegionKernel<f32>> {
+    static SELECTED: OnceLock<&'static dyn RegionKernel<f32>> = OnceLock::new();
+    if let Some(kernel) = SELECTED.get() {
+        return Ok(*kernel);
+    }
+    let name = std::env::var_os(KERNEL_VARIABLE).map(|name| name.to_string_lossy().into_owned());
+    let kernel = select(name.as_deref())?;
+    Ok(*SELECTED.get_or_init(|| kernel))
 }
 
 #[cfg(test)]

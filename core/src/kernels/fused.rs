@@ -1,1 +1,349 @@
-//! The fast kernel.
+//! The fast kernel: each region as one fused pass over tiles of points, in the processor's widest instructions.
+//!
+//! FiLM is folded into packed weights once an (image, region); all five layers, heads, spatial gradients and, on the
+//! way back, their recomputation run on a tile that stays in cache. Work is cut by sizes alone, never by the number
+//! of threads, and partial gradients are summed in a fixed order: the same bits at any thread count.
+
+use std::{cell::RefCell, ops::Range};
+
+use rayon::prelude::*;
+
+use self::{
+    products::TILE,
+    region::{Aligned, FoldedLayout, GradientLayout, PackedRegion, Plan, film_len, fold, unfold},
+    tile::{ResultRows, Tile, TileGradients},
+};
+use super::{Evaluation, Extent, Gradients, RegionKernel, check_length, simd::Lanes};
+use crate::error::{Error, Result};
+
+mod products;
+mod region;
+mod tile;
+
+/// Points of a piece of work when an image has many: fifty tiles repay the folding.
+const CHUNK_POINTS: usize = 50 * TILE;
+/// Pieces of work that a backward pass is cut into at least, if there are points enough: each costs memory.
+const BACKWARD_PIECES: usize = 64;
+/// Partial gradients held at a time, in values (32 MiB).
+const PARTIAL_VALUES: usize = 8 << 20;
+
+/// The fused kernel for one instruction set.
+pub struct Fused {
+    name: &'static str,
+    available: fn() -> bool,
+    forward: unsafe fn(&mut Scratch, &Piece<'_>, Shared),
+    backward: unsafe fn(&mut Scratch, &Piece<'_>, &[f32], &mut [f32], Shared),
+}
+
+/// Where many threads write, each its own places.
+#[derive(Clone, Copy)]
+struct Shared(*mut f32);
+
+// SAFETY: pieces of work write disjoint places, see `Piece`.
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+unsafe impl Sync for Shared {}
+
+/// A piece of work: some points of one (image, region).
+struct Piece<'a> {
+    evaluation: &'a Evaluation<'a, f32>,
+    plan: &'a Plan,
+    packed: &'a PackedRegion,
+    /// image · k + region
+    pair: usize,
+    points: Range<usize>,
+}
+
+impl<'a> Piece<'a> {
+    fn film(&self) -> &'a [f32] {
+        let len = film_len(self.plan.shape);
+        &self.evaluation.film[self.pair * len..][..len]
+    }
+
+    fn weights(&self) -> &'a [f32] {
+        let len = self.plan.shape.parameter_count();
+        &self.evaluation.weights[self.pair % self.evaluation.extent.regions * len..][..len]
+    }
+
+    /// The tiles: the index of the first point and the points.
+    fn tiles(&self) -> impl Iterator<Item = (usize, &'a [f32])> + use<'a> {
+        let columns = self.plan.shape.point_columns();
+        let image = self.pair / self.evaluation.extent.regions * self.evaluation.extent.points;
+        let points =
+            &self.evaluation.points[(image + self.points.start) * columns..(image + self.points.end) * columns];
+        let first = self.points.start;
+        points.chunks(TILE * columns).enumerate().map(move |(tile, points)| (first + tile * TILE, points))
+    }
+
+    /// The rows of this piece's (image, region) in a result, from point `first`.
+    fn rows(&self, result: Shared, first: usize) -> ResultRows {
+        let stride = self.evaluation.extent.points;
+        let start = self.pair * self.plan.rows.count * stride + first;
+        // SAFETY: within the result, whose length was checked.
+        ResultRows { start: unsafe { result.0.add(start) }, stride }
+    }
+}
+
+/// One thread's memory, kept between pieces of work.
+#[derive(Default)]
+struct Scratch {
+    folded: Aligned,
+    room: Aligned,
+    gradient: Aligned,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// # Safety
+/// The processor has V's instructions; `result` has the evaluation's length and no other piece has these points.
+#[inline(always)]
+unsafe fn forward_piece<V: Lanes, const ROWS: usize>(scratch: &mut Scratch, piece: &Piece<'_>, result: Shared) {
+    let layout = FoldedLayout::new(piece.plan);
+    scratch.room.grow(Tile::room_len(piece.plan));
+    // SAFETY: the caller's promise; room and folded memory were grown to their layouts.
+    unsafe {
+        let reverse = !piece.plan.sweeps.is_empty();
+        let bounds = fold::<V>(piece.plan, piece.packed, piece.weights(), piece.film(), &mut scratch.folded, reverse);
+        let (folded, room) = (scratch.folded.as_ptr(), scratch.room.as_mut_ptr());
+        let tile = Tile { plan: piece.plan, layout: &layout, folded, bounds, room };
+        for (first, points) in piece.tiles() {
+            tile.forward::<V, ROWS>(points, piece.rows(result, first));
+        }
+    }
+}
+
+/// # Safety
+/// As [`forward_piece`]; `points_gradient` is null or has N · columns values for every (image, region).
+#[inline(always)]
+unsafe fn backward_piece<V: Lanes, const ROWS: usize>(
+    scratch: &mut Scratch,
+    piece: &Piece<'_>,
+    upstream: &[f32],
+    partial: &mut [f32],
+    points_gradient: Shared,
+) {
+    let plan = piece.plan;
+    let (layout, gradient_layout) = (FoldedLayout::new(plan), GradientLayout::new(plan));
+    let columns = plan.shape.point_columns();
+    scratch.room.grow(Tile::room_len(plan));
+    scratch.gradient.grow(gradient_layout.len);
+    scratch.gradient.fill(0.0);
+    // SAFETY: the caller's promise; all scratch memory was grown to its layout. The upstream is only read.
+    unsafe {
+        let bounds = fold::<V>(plan, piece.packed, piece.weights(), piece.film(), &mut scratch.folded, true);
+        let (folded, room) = (scratch.folded.as_ptr(), scratch.room.as_mut_ptr());
+        let tile = Tile { plan, layout: &layout, folded, bounds, room };
+        let sums = scratch.gradient.as_mut_ptr();
+        for (first, points) in piece.tiles() {
+            let points_at = if points_gradient.0.is_null() {
+                points_gradient.0
+            } else {
+                points_gradient.0.add((piece.pair * piece.evaluation.extent.points + first) * columns)
+            };
+            let upstream = piece.rows(Shared(upstream.as_ptr().cast_mut()), first);
+            let gradients = TileGradients { layout: &gradient_layout, sums, points: points_at };
+            tile.backward::<V, ROWS>(points, upstream, &gradients);
+        }
+        let (weights, film) = partial.split_at_mut(plan.shape.parameter_count());
+        unfold::<V>(plan, piece.packed, piece.film(), &scratch.gradient, weights, film);
+    }
+}
+
+macro_rules! instruction_set {
+    ($kernel:ident, $module:ident, $name:literal, $lanes:ty, $rows:literal, $available:expr $(, $features:literal)?) => {
+        #[doc = concat!("The fused kernel `", $name, "`.")]
+        pub static $kernel: Fused =
+            Fused { name: $name, available: || $available, forward: $module::forward, backward: $module::backward };
+
+        mod $module {
+            use super::{Piece, Scratch, Shared};
+
+            /// # Safety
+            /// As [`super::forward_piece`].
+            $(#[target_feature(enable = $features)])?
+            pub unsafe fn forward(scratch: &mut Scratch, piece: &Piece<'_>, result: Shared) {
+                // SAFETY: this function's own features, the caller's promise.
+                unsafe { super::forward_piece::<$lanes, $rows>(scratch, piece, result) }
+            }
+
+            /// # Safety
+            /// As [`super::backward_piece`].
+            $(#[target_feature(enable = $features)])?
+            pub unsafe fn backward(
+                scratch: &mut Scratch,
+                piece: &Piece<'_>,
+                upstream: &[f32],
+                partial: &mut [f32],
+                points: Shared,
+            ) {
+                // SAFETY: this function's own features, the caller's promise.
+                unsafe { super::backward_piece::<$lanes, $rows>(scratch, piece, upstream, partial, points) }
+            }
+        }
+    };
+}
+
+// Rows of a block of registers: with three vectors of columns they use 24 of AVX-512's 32 registers, 12 of 16 else.
+#[cfg(target_arch = "x86_64")]
+instruction_set!(
+    AVX512,
+    avx512,
+    "avx512",
+    std::arch::x86_64::__m512,
+    8,
+    is_x86_feature_detected!("avx512f"),
+    "avx512f"
+);
+#[cfg(target_arch = "x86_64")]
+instruction_set!(
+    AVX2,
+    avx2,
+    "avx2",
+    std::arch::x86_64::__m256,
+    4,
+    is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+    "avx2,fma"
+);
+instruction_set!(PORTABLE, portable, "portable", crate::kernels::simd::Portable, 4, true);
+
+impl Fused {
+    fn check(&self) -> Result<()> {
+        if (self.available)() {
+            Ok(())
+        } else {
+            Err(Error::config("CNERF_KERNEL", format!("this processor cannot run `{}`; leave it unset", self.name)))
+        }
+    }
+}
+
+impl RegionKernel<f32> for Fused {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn available(&self) -> bool {
+        (self.available)()
+    }
+
+    fn forward(&self, evaluation: &Evaluation<'_, f32>, result: &mut [f32]) -> Result<()> {
+        self.check()?;
+        check_length("result", &[evaluation.result_len()], result.len())?;
+        let plan = Plan::new(evaluation.shape, evaluation.outputs);
+        let packed = pack(evaluation, &plan);
+        let cut = Cut::new(evaluation.extent, evaluation.extent.points.div_ceil(CHUNK_POINTS));
+        let shared = Shared(result.as_mut_ptr());
+        (0..cut.pieces()).into_par_iter().for_each(|index| {
+            let piece = cut.piece(index, evaluation, &plan, &packed);
+            // SAFETY: `check` found the instructions; the pieces' points are disjoint and cover the checked result.
+            SCRATCH.with_borrow_mut(|scratch| unsafe { (self.forward)(scratch, &piece, shared) });
+        });
+        Ok(())
+    }
+
+    fn backward(
+        &self,
+        evaluation: &Evaluation<'_, f32>,
+        upstream: &[f32],
+        gradients: Gradients<'_, f32>,
+    ) -> Result<()> {
+        self.check()?;
+        check_length("upstream", &[evaluation.result_len()], upstream.len())?;
+        gradients.check(evaluation)?;
+        let Extent { images, regions, points } = evaluation.extent;
+        let plan = Plan::new(evaluation.shape, evaluation.outputs);
+        let packed = pack(evaluation, &plan);
+        let enough = BACKWARD_PIECES.div_ceil((images * regions).max(1));
+        let cut = Cut::new(evaluation.extent, points.div_ceil(CHUNK_POINTS).min(enough));
+        let (parameters, film_len) = (plan.shape.parameter_count(), film_len(plan.shape));
+        let partial_len = parameters + film_len;
+
+        let image_values = points * plan.shape.point_columns();
+        let mut per_region = vec![0.0; if gradients.points.is_some() { images * regions * image_values } else { 0 }];
+        let shared = Shared(if gradients.points.is_some() { per_region.as_mut_ptr() } else { std::ptr::null_mut() });
+
+        gradients.weights.fill(0.0);
+        gradients.film.fill(0.0);
+        let wave = (PARTIAL_VALUES / partial_len).clamp(1, cut.pieces().max(1));
+        let mut partials = vec![0.0; wave * partial_len];
+        for first in (0..cut.pieces()).step_by(wave) {
+            let indices = first..cut.pieces().min(first + wave);
+            let partials = &mut partials[..indices.len() * partial_len];
+            partials.par_chunks_exact_mut(partial_len).zip(indices.clone()).for_each(|(partial, index)| {
+                let piece = cut.piece(index, evaluation, &plan, &packed);
+                // SAFETY: `check` found the instructions; lengths were checked; the pieces' points are disjoint.
+                SCRATCH.with_borrow_mut(|scratch| unsafe {
+                    (self.backward)(scratch, &piece, upstream, partial, shared);
+                });
+            });
+            let pieces = || partials.chunks_exact(partial_len).zip(indices.clone());
+            gradients.weights.par_chunks_exact_mut(parameters).enumerate().for_each(|(region, sum)| {
+                for (partial, _) in pieces().filter(|(_, index)| cut.pair(*index) % regions == region) {
+                    add(sum, &partial[..parameters]);
+                }
+            });
+            for (partial, index) in pieces() {
+                add(&mut gradients.film[cut.pair(index) * film_len..][..film_len], &partial[parameters..]);
+            }
+        }
+        if let Some(sum) = gradients.points
+            && image_values > 0
+        {
+            let images = per_region.par_chunks_exact(regions.max(1) * image_values);
+            sum.par_chunks_exact_mut(image_values).zip(images).for_each(|(sum, image)| {
+                sum.fill(0.0);
+                image.chunks_exact(image_values).for_each(|region| add(sum, region));
+            });
+        }
+        Ok(())
+    }
+}
+
+fn add(sum: &mut [f32], terms: &[f32]) {
+    for (sum, term) in sum.iter_mut().zip(terms) {
+        *sum += term;
+    }
+}
+
+fn pack(evaluation: &Evaluation<'_, f32>, plan: &Plan) -> Vec<PackedRegion> {
+    let regions = evaluation.weights.par_chunks_exact(plan.shape.parameter_count());
+    regions.map(|weights| PackedRegion::new(plan, weights)).collect()
+}
+
+/// How an evaluation is cut into pieces: by sizes alone.
+struct Cut {
+    extent: Extent,
+    /// Points of every chunk but the last.
+    chunk_points: usize,
+    chunks: usize,
+}
+
+impl Cut {
+    /// Into at most `chunks` for every (image, region).
+    fn new(extent: Extent, chunks: usize) -> Self {
+        let chunk_points = extent.points.div_ceil(chunks.max(1)).next_multiple_of(TILE).max(TILE);
+        Self { extent, chunk_points, chunks: extent.points.div_ceil(chunk_points) }
+    }
+
+    fn pieces(&self) -> usize {
+        self.extent.images * self.extent.regions * self.chunks
+    }
+
+    fn pair(&self, index: usize) -> usize {
+        index / self.chunks
+    }
+
+    fn piece<'a>(
+        &self,
+        index: usize,
+        evaluation: &'a Evaluation<'a, f32>,
+        plan: &'a Plan,
+        packed: &'a [PackedRegion],
+    ) -> Piece<'a> {
+        let pair = self.pair(index);
+        let start = index % self.chunks * self.chunk_points;
+        let points = start..self.extent.points.min(start + self.chunk_points);
+        Piece { evaluation, plan, packed: &packed[pair % self.extent.regions], pair, points }
+    }
+}
