@@ -153,7 +153,10 @@ impl Discriminator {
                     let shape = LayerShape { padding: 0, ..LayerShape::linear(features + 1, features, 3) };
                     let realness = linears("realness", features * 4, 1)?;
                     let class = linears("class", features * 4, REGION_COUNT)?;
-                    (Layer::new(Family::Coordinates, shape, &parameters_last)?, Heads::RealnessAndClass(realness, class))
+                    (
+                        Layer::new(Family::Coordinates, shape, &parameters_last)?,
+                        Heads::RealnessAndClass(realness, class),
+                    )
                 }
                 DiscriminatorKind::HighResolution => {
                     let shape = LayerShape::activated(features + 1, features, 3);
@@ -348,7 +351,7 @@ mod tests {
         for kind in KINDS {
             let (network, parameters, resolution) = build(kind);
             let (image, masks) = inputs(kind, 4, resolution);
-            check_parameter_gradients(&parameters, 1e-4, || {
+            check_parameter_gradients(&parameters, 1e-7, 1e-4, || {
                 let (_, gradients) = network.forward_with_input_gradients(&image, &masks).unwrap();
                 (crate::train::adversarial::r1(&gradients.image).unwrap()
                     + (crate::train::adversarial::r1(&gradients.masks).unwrap() * 100.0).unwrap())

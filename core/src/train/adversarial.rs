@@ -125,12 +125,15 @@ pub fn discriminator_loss(
         }
     };
     let mut on_predictions = auxiliary.loss(&fake)?;
-    if let (Auxiliary::Class { .. }, Some(on_fake), Some(on_real)) = (auxiliary, &on_predictions, auxiliary.loss(&real)?) {
+    if let (Auxiliary::Class { .. }, Some(on_fake), Some(on_real)) =
+        (auxiliary, &on_predictions, auxiliary.loss(&real)?)
+    {
         on_predictions = Some((on_fake + on_real)?);
     }
     let logistic = logistic_loss(&real.realness, &fake.realness)?;
     let (r1_image, r1_masks) = penalties.unzip();
-    let total = [&r1_image, &r1_masks, &on_predictions].into_iter().flatten().try_fold(logistic.clone(), |a, b| a + b)?;
+    let total =
+        [&r1_image, &r1_masks, &on_predictions].into_iter().flatten().try_fold(logistic.clone(), |a, b| a + b)?;
     Ok(DiscriminatorLoss { total, logistic, r1_image, r1_masks, auxiliary: on_predictions })
 }
 

@@ -223,7 +223,7 @@ mod tests {
         let (network, parameters) = build(&config());
         let (input, codes) = (random_input(1, 2, 8, 5), random(2, &[2, 9, 2, 7]));
         let target = random(4, &[2, 3, 32, 32]);
-        check_parameter_gradients(&parameters, 1e-6, || {
+        check_parameter_gradients(&parameters, 1e-5, 1e-6, || {
             let output = network.forward(&input, &codes, Noise::Off).unwrap();
             (output.rgb - &target).unwrap().sqr().unwrap().mean_all().unwrap()
         });
