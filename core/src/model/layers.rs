@@ -9,18 +9,26 @@ use candle_core::{DType, Device, Tensor};
 
 use crate::{
     error::Result,
+    kernels::conv,
     parameters::{Init, Parameters},
 };
 
-/// `input` `[B, I, h, w]` correlated with `weight` `[O, I, k, k]`.
+/// `input` `[B, I, h, w]` correlated with `weight` `[O, I, k, k]`, plus `bias` `[O]`.
 ///
 /// The one place where the 2D networks reach a convolution kernel, together with [`convolve_adjoint`].
-pub fn convolve(input: &Tensor, weight: &Tensor, stride: usize, padding: usize) -> Result<Tensor> {
+pub fn convolve(
+    input: &Tensor,
+    weight: &Tensor,
+    bias: Option<&Tensor>,
+    stride: usize,
+    padding: usize,
+) -> Result<Tensor> {
     let (outputs, inputs, kernel, _) = weight.dims4()?;
     if kernel == 1 && stride == 1 && padding == 0 {
-        return mix_channels(&weight.reshape((outputs, inputs))?, input);
+        let mixed = mix_channels(&weight.reshape((outputs, inputs))?, input)?;
+        return bias.map_or_else(|| Ok(mixed.clone()), |bias| add_bias(&mixed, bias));
     }
-    Ok(input.conv2d(weight, padding, stride, 1, 1)?)
+    conv::conv2d(input, weight, bias, stride, padding)
 }
 
 /// The adjoint of [`convolve`]: takes the gradient `[B, O, h', w']` of its output to the gradient `[B, I, size]` of its
@@ -36,9 +44,7 @@ pub fn convolve_adjoint(
     if kernel == 1 && stride == 1 && padding == 0 {
         return mix_channels(&weight.reshape((outputs, inputs))?.t()?, gradient);
     }
-    let covered = (gradient.dim(2)? - 1) * stride + kernel;
-    let rest = (size.0 + 2 * padding).saturating_sub(covered);
-    Ok(gradient.conv_transpose2d(weight, padding, rest, stride, 1)?)
+    conv::conv2d_input_gradient(gradient, weight, size, stride, padding)
 }
 
 /// `[O, I]` applied to every pixel of `[B, I, h, w]`.
@@ -74,7 +80,7 @@ impl Convolution {
 
     /// `[B, I, h, w]` → `[B, O, h, w]`.
     pub fn forward(&self, input: &Tensor) -> Result<Tensor> {
-        add_bias(&convolve(input, &self.weight, 1, self.padding)?, &self.bias)
+        convolve(input, &self.weight, Some(&self.bias), 1, self.padding)
     }
 }
 
@@ -212,7 +218,7 @@ impl EqualConvolution {
     pub fn forward(&self, input: &Tensor) -> Result<Tensor> {
         let (_, inputs, kernel, _) = self.weight.dims4()?;
         let weight = (&self.weight / ((inputs * kernel * kernel) as f64).sqrt())?;
-        let output = add_bias(&convolve(input, &weight, 1, kernel / 2)?, &self.bias)?;
+        let output = convolve(input, &weight, Some(&self.bias), 1, kernel / 2)?;
         Ok((leaky_relu(&output)? * std::f64::consts::SQRT_2)?)
     }
 }
@@ -354,7 +360,7 @@ mod tests {
         }
         for (kernel, stride, padding, size) in [(3, 1, 1, 8), (3, 2, 0, 9), (1, 1, 0, 8), (2, 1, 0, 4), (3, 2, 0, 8)] {
             let (input, weight) = (random(4, &[2, 3, size, size]), random(5, &[4, 3, kernel, kernel]));
-            let output = convolve(&input, &weight, stride, padding).unwrap();
+            let output = convolve(&input, &weight, None, stride, padding).unwrap();
             let gradient = random(6, output.dims());
             let adjoint = convolve_adjoint(&gradient, &weight, stride, padding, (size, size)).unwrap();
             assert_eq!(adjoint.dims(), input.dims());

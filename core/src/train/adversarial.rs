@@ -8,7 +8,7 @@ use candle_core::Tensor;
 use crate::{
     error::Result,
     model::discriminator::{Discriminator, Judgement},
-    train::losses::{cross_entropy, smooth_l1},
+    train::losses,
 };
 
 /// log(1 + exp(x)), stable for any x.
@@ -74,8 +74,8 @@ impl Auxiliary<'_> {
     /// The weighted loss of a prediction, if the discriminator makes one.
     fn loss(&self, judgement: &Judgement) -> Result<Option<Tensor>> {
         Ok(match (self, &judgement.view, &judgement.class) {
-            (Self::View { angles_rad, weight }, Some(view), _) => Some((smooth_l1(view, angles_rad)? * *weight)?),
-            (Self::Class { labels, weight }, _, Some(class)) => Some((cross_entropy(class, labels)? * *weight)?),
+            (Self::View { angles_rad, weight }, Some(view), _) => Some((losses::view(view, angles_rad)? * *weight)?),
+            (Self::Class { labels, weight }, _, Some(class)) => Some((losses::classification(class, labels)? * *weight)?),
             _ => None,
         })
     }

@@ -5,7 +5,7 @@ use candle_core::{DType, Device, Tensor};
 
 use crate::{
     error::Result,
-    model::layers::{EqualLinear, Resampling, add_bias, convolve, convolve_adjoint, leaky_slope, linear},
+    model::layers::{EqualLinear, Resampling, convolve, convolve_adjoint, leaky_slope, linear},
     parameters::{Init, Parameters},
 };
 
@@ -107,16 +107,15 @@ impl Layer {
         let (_, _, height, width) = input.dims4()?;
         let weight = (&self.weight * self.scale)?;
         let seen = if self.shape.coordinates { weight.narrow(1, 0, inputs)?.contiguous()? } else { weight.clone() };
-        let mut output = convolve(&input, &seen, stride, padding)?;
-        if self.shape.coordinates {
+        let mut output = if self.shape.coordinates {
             // The coordinates are the same for all pictures: their share is computed once.
             let coordinates = coordinates(height, width, input.dtype(), input.device())?;
-            let share = convolve(&coordinates, &weight.narrow(1, inputs, 2)?.contiguous()?, stride, padding)?;
-            output = output.broadcast_add(&share)?;
-        }
-        if let Some(bias) = &self.bias {
-            output = add_bias(&output, bias)?;
-        }
+            let weight = weight.narrow(1, inputs, 2)?.contiguous()?;
+            let share = convolve(&coordinates, &weight, self.bias.as_ref(), stride, padding)?;
+            convolve(&input, &seen, None, stride, padding)?.broadcast_add(&share)?
+        } else {
+            convolve(&input, &seen, self.bias.as_ref(), stride, padding)?
+        };
         tape.push(move |gradient| convolve_adjoint(gradient, &seen, stride, padding, (height, width)));
         if let Some(gain) = self.gain {
             let slope = (leaky_slope(&output)? * gain)?;

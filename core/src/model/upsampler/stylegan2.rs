@@ -437,8 +437,8 @@ impl ModulatedConvolution {
 
     fn convolve(&self, input: &Tensor, weight: &Tensor) -> Result<Tensor> {
         match self.kind {
-            ConvolutionKind::Plain => convolve(input, weight, 1, 1),
-            ConvolutionKind::Picture => convolve(input, weight, 1, 0),
+            ConvolutionKind::Plain => convolve(input, weight, None, 1, 1),
+            ConvolutionKind::Picture => convolve(input, weight, None, 1, 0),
             ConvolutionKind::Upsampling => {
                 let (_, _, height, width) = input.dims4()?;
                 let weight = weight.transpose(0, 1)?.contiguous()?;
@@ -454,7 +454,7 @@ impl ModulatedConvolution {
             ConvolutionKind::Picture => convolve_adjoint(gradient, weight, 1, 0, size),
             ConvolutionKind::Upsampling => {
                 let blurred = Resampling::BLUR_AFTER_UP.adjoint(gradient, (2 * size.0 + 1, 2 * size.1 + 1))?;
-                convolve(&blurred, &weight.transpose(0, 1)?.contiguous()?, 2, 0)
+                convolve(&blurred, &weight.transpose(0, 1)?.contiguous()?, None, 2, 0)
             }
         }
     }
