@@ -12,6 +12,7 @@ use crate::{
 pub mod frame;
 pub mod integrate;
 pub mod sampling;
+pub mod trajectory;
 
 pub use crate::kernels::Outputs;
 pub use frame::{Frame, RenderSettings, TwoPass, render_frame, render_rays};
