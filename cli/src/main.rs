@@ -1,1 +1,27 @@
-fn main() {}
+//! `cnerf`: invert, edit and render portraits in 3D. Arguments, progress bars, files and exit codes; nothing is
+//! computed here.
+
+mod commands;
+mod console;
+mod options;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+
+/// Tensors of tens of megabytes come and go at every step; without a pooling allocator their page faults cost more
+/// than the arithmetic on them.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+fn main() -> ExitCode {
+    let arguments = commands::Arguments::parse();
+    let console = console::Console::new(&arguments.global);
+    match commands::run(arguments, &console) {
+        Ok(outcome) => outcome.into(),
+        Err(error) => {
+            console.error(&error);
+            ExitCode::from(2)
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! `cnerf train`: listens to a trainer and draws its progress.
+
+use std::{
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use anyhow::{Context as _, bail};
+use clap::Args;
+use cnerf_core::{
+    data::dataset::Dataset,
+    eval::perceptual::Perceptual,
+    model::generator::Generator,
+    parameters::Parameters,
+    train::{
+        config::{Preset, Stage, TrainConfig},
+        events::Event,
+        trainer::{Inputs, Trainer, steps},
+    },
+};
+use serde::Serialize;
+
+use crate::{
+    console::{Console, Outcome},
+    options::ModelOptions,
+};
+
+/// Arguments of `cnerf train`.
+#[derive(Args, Debug)]
+pub struct TrainArguments {
+    /// Dataset: a folder or a zip (`cnerf dataset check` says whether it is sound)
+    #[arg(long, value_name = "PATH")]
+    data: PathBuf,
+    /// Folder of the run
+    #[arg(long, value_name = "RUN")]
+    out: PathBuf,
+    /// Settings to start from
+    #[arg(long, value_enum, default_value_t = Preset::Portrait)]
+    preset: Preset,
+    /// What to train
+    #[arg(long, value_enum, default_value_t = Stage::All)]
+    stage: Stage,
+    /// Thousands of portraits to show in each stage, in place of the preset's steps
+    #[arg(long, value_name = "N")]
+    kimg: Option<f64>,
+    /// Portraits a step, in place of the preset's
+    #[arg(long, value_name = "N")]
+    batch: Option<usize>,
+    /// Continue the run in --out
+    #[arg(long)]
+    resume: bool,
+    /// Print the resolved configuration and sizes, and stop
+    #[arg(long)]
+    dry_run: bool,
+    /// Change one setting, e.g. warmup.steps=500; may repeat
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// LPIPS weights (AlexNet or VGG16, safetensors) for the perceptual losses
+    #[arg(long, value_name = "FILE")]
+    lpips: Option<PathBuf>,
+    /// Start from --model instead of fresh weights
+    #[command(flatten)]
+    model: ModelOptions,
+}
+
+#[derive(Serialize)]
+struct Report {
+    run: PathBuf,
+    model: Option<PathBuf>,
+    steps: usize,
+    seconds: f64,
+    metrics: serde_json::Value,
+    interrupted: bool,
+}
+
+#[derive(Serialize)]
+struct DryRun {
+    config: TrainConfig,
+    portraits: usize,
+    generator_parameters: usize,
+    steps: usize,
+}
+
+impl TrainArguments {
+    /// Trains until done or interrupted.
+    pub fn run(self, seed: Option<u64>, console: &Console) -> anyhow::Result<Outcome> {
+        let config = self.resolve(seed)?;
+        let dataset = Dataset::open(&self.data)?;
+        if self.dry_run {
+            return self.dry_run(&config, dataset.len(), console);
+        }
+        let device = self.model.device()?;
+        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path)).transpose()?;
+        let start = self.model.model.as_ref().map(|name| Generator::open(name, &device)).transpose()?;
+        let inputs = Inputs { dataset, perceptual, start, device };
+        let trainer = if self.resume {
+            Trainer::resume(config, self.stage, inputs, &self.out)?
+        } else {
+            Trainer::new(config, self.stage, inputs, &self.out)?
+        };
+        self.listen(trainer, console)
+    }
+
+    /// The configuration: the run's own when resuming, else the preset's; then --kimg, --batch and --set.
+    fn resolve(&self, seed: Option<u64>) -> anyhow::Result<TrainConfig> {
+        let mut config = if self.resume {
+            let path = self.out.join("config.toml");
+            let text = std::fs::read_to_string(&path)
+                .with_context(|| format!("{}: no run to resume here; leave --resume out to start one", path.display()))?;
+            TrainConfig::from_toml(&text).with_context(|| path.display().to_string())?
+        } else {
+            TrainConfig::preset(self.preset)
+        };
+        config.seed = seed.unwrap_or(config.seed);
+        if let Some(batch) = self.batch {
+            (config.warmup.batch, config.field.batch, config.upsampler.batch) = (batch, batch, batch);
+        }
+        if let Some(thousands) = self.kimg {
+            if !(thousands > 0.0 && thousands <= 1e9) {
+                bail!("--kimg {thousands}: must be a positive number");
+            }
+            let steps = |batch: usize| ((thousands * 1000.0 / batch.max(1) as f64).ceil() as usize).max(1);
+            config.warmup.steps = steps(config.warmup.batch);
+            config.field.steps = steps(config.field.batch);
+            config.upsampler.steps = steps(config.upsampler.batch);
+        }
+        Ok(config.with(&self.set)?)
+    }
+
+    fn dry_run(&self, config: &TrainConfig, portraits: usize, console: &Console) -> anyhow::Result<Outcome> {
+        let parameters = Parameters::fresh(config.seed, candle_core::DType::F32, &candle_core::Device::Cpu);
+        Generator::new(&config.model, &parameters)?;
+        let steps = steps(config, self.stage);
+        let report = DryRun { config: config.clone(), portraits, generator_parameters: parameters.count(), steps };
+        console.result(&report, || {
+            let text = config.to_toml().unwrap_or_default();
+            format!("{text}\n{portraits} portraits · {} parameters · {steps} steps", report.generator_parameters)
+        })?;
+        Ok(Outcome::Done)
+    }
+
+    fn listen(&self, mut trainer: Trainer, console: &Console) -> anyhow::Result<Outcome> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&stop);
+        ctrlc::set_handler(move || {
+            // The first Ctrl-C finishes the step and writes a checkpoint; the second one ends at once.
+            if asked.swap(true, Ordering::SeqCst) {
+                std::process::exit(130);
+            }
+        })?;
+        let began = std::time::Instant::now();
+        let mut bar = console.bar(0, "");
+        let (mut model, mut last) = (None, None);
+        let mut interrupted = false;
+        while let Some(events) = trainer.step()? {
+            for event in events {
+                match event {
+                    Event::Stage { stage, step, total } => {
+                        bar.finish_and_clear();
+                        bar = console.bar(total as u64, format!("{stage:?}").to_lowercase());
+                        bar.set_position(step as u64);
+                    }
+                    Event::Step(report) => {
+                        bar.set_length(report.total as u64);
+                        bar.set_position(report.step as u64);
+                        let shown = report.metrics.0.iter().take(4).map(|(name, value)| format!("{name} {value:.4}"));
+                        bar.set_message(shown.collect::<Vec<_>>().join("  "));
+                        last = Some(report);
+                    }
+                    Event::Samples(path) | Event::Checkpoint(path) => bar.suspend(|| console.note(path.display())),
+                    Event::Model(path) => model = Some(path),
+                    Event::Warning(text) => bar.suspend(|| console.warn(text)),
+                }
+            }
+            if stop.load(Ordering::SeqCst) {
+                if let Some(path) = trainer.checkpoint()? {
+                    bar.suspend(|| console.note(path.display()));
+                }
+                interrupted = true;
+                break;
+            }
+        }
+        bar.finish_and_clear();
+        let report = Report {
+            run: self.out.clone(),
+            model,
+            steps: last.as_ref().map_or(0, |report| report.step),
+            seconds: began.elapsed().as_secs_f64(),
+            metrics: last.map_or(serde_json::Value::Null, |report| serde_json::to_value(report.metrics).unwrap_or_default()),
+            interrupted,
+        };
+        let resume = format!("cnerf train --data {} --out {} --resume", self.data.display(), self.out.display());
+        console.result(&report, || match &report.model {
+            Some(path) if !report.interrupted => format!("{} after {:.0} s", path.display(), report.seconds),
+            _ => format!("stopped after step {}; continue with: {resume}", report.steps),
+        })?;
+        Ok(if interrupted { Outcome::Partial } else { Outcome::Done })
+    }
+}

@@ -1,0 +1,269 @@
+//! The trainer: runs the stages one after the other, one optimiser step a call, and keeps the run's folder.
+//!
+//! `RUN/config.toml` the resolved configuration · `log.jsonl` a line every few steps · `samples/` grids ·
+//! `checkpoints/` all that is needed to continue · `model.safetensors` the result.
+
+use std::{
+    fs::OpenOptions,
+    io::Write as _,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use candle_core::Device;
+use image::RgbImage;
+
+use crate::{
+    data::dataset::Dataset,
+    error::{Error, Result},
+    eval::perceptual::Perceptual,
+    model::{
+        file::{self, Tensors},
+        generator::Generator,
+    },
+    train::{
+        checkpoint::{CheckpointHeader, Checkpoints},
+        config::{Stage, TrainConfig},
+        events::{Event, Metrics, StepReport},
+        field_stage::FieldStage,
+        upsampler_stage::UpsamplerStage,
+        warmup::Warmup,
+    },
+};
+
+/// One stage of training: knows its losses and its state, nothing of files.
+pub trait StageRun {
+    /// Does optimiser step number `step` (from 0) and says what was measured.
+    fn step(&mut self, step: usize) -> Result<Metrics>;
+    /// Everything that changes from step to step.
+    fn save(&self, tensors: &mut Tensors) -> Result<()>;
+    /// Takes back what [`Self::save`] gave.
+    fn load(&mut self, tensors: &Tensors) -> Result<()>;
+    /// A grid of pictures that shows how far the stage is.
+    fn samples(&self) -> Result<RgbImage>;
+    /// The generator as it would be shipped now.
+    fn finished(&self) -> Result<Generator>;
+}
+
+/// What a run needs besides its configuration.
+pub struct Inputs {
+    /// Portraits, masks and cameras.
+    pub dataset: Dataset,
+    /// Perceptual features for the losses that use them.
+    pub perceptual: Option<Perceptual>,
+    /// A model to start from instead of fresh weights.
+    pub start: Option<Generator>,
+    /// Where to compute.
+    pub device: Device,
+}
+
+/// Runs the stages of a configuration.
+pub struct Trainer {
+    config: TrainConfig,
+    inputs: Inputs,
+    run: PathBuf,
+    stages: Vec<Stage>,
+    checkpoints: Checkpoints,
+    current: Option<Current>,
+    finished: Option<Generator>,
+    last_checkpoint: Option<PathBuf>,
+}
+
+struct Current {
+    position: usize,
+    step: usize,
+    stage: Box<dyn StageRun>,
+}
+
+impl Trainer {
+    /// A new run in the folder `run`, which must not hold one yet.
+    pub fn new(config: TrainConfig, stage: Stage, inputs: Inputs, run: &Path) -> Result<Self> {
+        if run.join("config.toml").exists() {
+            return Err(Error::malformed(run, "holds a run already; pass --resume to continue it or choose another folder"));
+        }
+        let trainer = Self::open(config, stage, inputs, run)?;
+        file::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
+        Ok(trainer)
+    }
+
+    /// Continues the run in the folder `run` from its newest checkpoint, or from its start if it has none.
+    pub fn resume(config: TrainConfig, stage: Stage, inputs: Inputs, run: &Path) -> Result<Self> {
+        let mut trainer = Self::open(config, stage, inputs, run)?;
+        if let Some((path, header, tensors)) = trainer.checkpoints.newest()? {
+            let position = trainer.stages.iter().position(|known| *known == header.stage).ok_or_else(|| {
+                Error::malformed(&path, format!("was written by stage {:?}, which this run does not have", header.stage))
+            })?;
+            let mut current = trainer.begin(position)?;
+            current.stage.load(&tensors)?;
+            current.step = header.step;
+            trainer.current = Some(current);
+            trainer.last_checkpoint = Some(path);
+        }
+        Ok(trainer)
+    }
+
+    fn open(config: TrainConfig, stage: Stage, inputs: Inputs, run: &Path) -> Result<Self> {
+        config.validate()?;
+        let stages = stages(&config, stage)?;
+        let checkpoints = Checkpoints::of(run, 2);
+        let (run, current, finished) = (run.to_owned(), None, None);
+        Ok(Self { config, inputs, run, stages, checkpoints, current, finished, last_checkpoint: None })
+    }
+
+    /// The resolved configuration.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// Does one optimiser step; `None` when the run is done. An error leaves the last checkpoint as it was.
+    pub fn step(&mut self) -> Result<Option<Vec<Event>>> {
+        let mut events = Vec::new();
+        let mut current = match self.current.take() {
+            Some(current) => current,
+            None if self.finished.is_some() => return Ok(None),
+            None => self.begin(0)?,
+        };
+        let stage = self.stages[current.position];
+        let total = steps(&self.config, stage);
+        let began = Instant::now();
+        let metrics = current.stage.step(current.step).map_err(|error| self.explain(error))?;
+        if let Some(quantity) = metrics.first_not_finite() {
+            return Err(self.explain(Error::not_finite(quantity)));
+        }
+        if current.step == 0 {
+            events.push(Event::Stage { stage, step: 0, total });
+        }
+        current.step += 1;
+        let step = current.step;
+        let report = StepReport { stage, step, total, seconds: began.elapsed().as_secs_f64(), metrics };
+        if step % self.config.log_steps == 0 || step == 1 || step == total {
+            self.log(&report)?;
+        }
+        events.push(Event::Step(report));
+        if step % self.config.sample_steps == 0 || step == total {
+            events.push(self.write_samples(&current, stage));
+        }
+        if step % self.config.checkpoint_steps == 0 || step == total {
+            events.push(Event::Checkpoint(self.write_checkpoint(&current)?));
+        }
+        if step < total {
+            self.current = Some(current);
+        } else {
+            events.extend(self.advance(current)?);
+        }
+        Ok(Some(events))
+    }
+
+    /// Writes a checkpoint now, e.g. because the user wants to stop.
+    pub fn checkpoint(&mut self) -> Result<Option<PathBuf>> {
+        let Some(current) = self.current.take() else { return Ok(None) };
+        let path = self.write_checkpoint(&current);
+        self.current = Some(current);
+        path.map(Some)
+    }
+
+    /// Ends a stage: the next one begins from its result, or the model is written.
+    fn advance(&mut self, current: Current) -> Result<Vec<Event>> {
+        let generator = current.stage.finished()?;
+        let path = self.run.join("model.safetensors");
+        generator.save(&path, &format!("{:?}", self.config.preset).to_lowercase(), &self.provenance(current.position))?;
+        let events = vec![Event::Model(path)];
+        self.finished = Some(generator);
+        if current.position + 1 < self.stages.len() {
+            self.current = Some(self.begin(current.position + 1)?);
+        }
+        Ok(events)
+    }
+
+    fn begin(&mut self, position: usize) -> Result<Current> {
+        let start = self.finished.take().or_else(|| self.inputs.start.clone());
+        let stage: Box<dyn StageRun> = match self.stages[position] {
+            Stage::Warmup => Box::new(Warmup::new(&self.config, &self.inputs, start)?),
+            Stage::Field => Box::new(FieldStage::new(&self.config, &self.inputs, start)?),
+            Stage::Upsampler | Stage::All => Box::new(UpsamplerStage::new(&self.config, &self.inputs, start)?),
+        };
+        Ok(Current { position, step: 0, stage })
+    }
+
+    fn provenance(&self, position: usize) -> String {
+        let stages: Vec<String> = self.stages[..=position]
+            .iter()
+            .map(|stage| format!("{} {} steps", format!("{stage:?}").to_lowercase(), steps(&self.config, *stage)))
+            .collect();
+        format!("trained by cnerf {}: {}; {} portraits; seed {}", env!("CARGO_PKG_VERSION"), stages.join(", "), self.inputs.dataset.len(), self.config.seed)
+    }
+
+    fn write_checkpoint(&mut self, current: &Current) -> Result<PathBuf> {
+        let before: usize = self.stages[..current.position].iter().map(|stage| steps(&self.config, *stage)).sum();
+        let header = CheckpointHeader { stage: self.stages[current.position], step: current.step };
+        let mut tensors = Tensors::new();
+        current.stage.save(&mut tensors)?;
+        let path = self.checkpoints.write(before + current.step, &header, &tensors)?;
+        self.last_checkpoint = Some(path.clone());
+        Ok(path)
+    }
+
+    /// A failed preview must not end hours of training.
+    fn write_samples(&self, current: &Current, stage: Stage) -> Event {
+        let name = format!("{}-{:06}.png", format!("{stage:?}").to_lowercase(), current.step);
+        let path = self.run.join("samples").join(name);
+        let written = current.stage.samples().and_then(|picture| {
+            let mut bytes = std::io::Cursor::new(Vec::new());
+            picture.write_to(&mut bytes, image::ImageFormat::Png).map_err(|error| Error::malformed(&path, error))?;
+            file::write_atomically(&path, bytes.get_ref())
+        });
+        match written {
+            Ok(()) => Event::Samples(path),
+            Err(error) => Event::Warning(format!("no sample grid at step {}: {error}", current.step)),
+        }
+    }
+
+    fn log(&self, report: &StepReport) -> Result<()> {
+        let path = self.run.join("log.jsonl");
+        let failed = |error| Error::io(&path, error);
+        std::fs::create_dir_all(&self.run).map_err(failed)?;
+        let line = serde_json::to_string(report).map_err(|error| Error::malformed(&path, error))?;
+        let mut log = OpenOptions::new().create(true).append(true).open(&path).map_err(failed)?;
+        writeln!(log, "{line}").map_err(failed)
+    }
+
+    /// Says, for a number that is not finite, where the run can be picked up.
+    fn explain(&self, error: Error) -> Error {
+        match error {
+            Error::NotFinite { quantity, context: None } => {
+                let context = match &self.last_checkpoint {
+                    Some(path) => format!("the last good checkpoint is {}; resume with a lower learning rate", path.display()),
+                    None => "no checkpoint was written yet; start again with a lower learning rate".into(),
+                };
+                Error::NotFinite { quantity, context: Some(context) }
+            }
+            other => other,
+        }
+    }
+}
+
+/// The stages a run consists of; `all` takes those that the configuration gives steps.
+fn stages(config: &TrainConfig, stage: Stage) -> Result<Vec<Stage>> {
+    let stages = match stage {
+        Stage::All => [Stage::Warmup, Stage::Field, Stage::Upsampler].into_iter().filter(|stage| steps(config, *stage) > 0).collect(),
+        single => vec![single],
+    };
+    match stages.iter().find(|stage| steps(config, **stage) == 0) {
+        Some(stage) => {
+            let name = format!("{stage:?}").to_lowercase();
+            Err(Error::config(format!("{name}.steps"), format!("this preset gives stage {name} no steps; pass --set {name}.steps=N or --kimg")))
+        }
+        None if stages.is_empty() => Err(Error::config("--stage", "no stage has any steps")),
+        None => Ok(stages),
+    }
+}
+
+/// Steps the configuration gives a stage.
+pub fn steps(config: &TrainConfig, stage: Stage) -> usize {
+    match stage {
+        Stage::Warmup => config.warmup.steps,
+        Stage::Field => config.field.steps,
+        Stage::Upsampler => config.upsampler.steps,
+        Stage::All => config.warmup.steps + config.field.steps + config.upsampler.steps,
+    }
+}
