@@ -1,5 +1,6 @@
 //! The generator, its discriminators, and the files they live in.
 
+pub mod built_in;
 pub mod discriminator;
 pub mod field;
 pub mod file;

@@ -1,0 +1,362 @@
+//! Stage `warmup`: every training portrait gets a code of its own and is reconstructed from its known camera
+//! (shared/recipe). Random rays of random portraits a step; codes, mapping and field learn together.
+
+use candle_core::{DType, Device, Tensor, Var};
+use image::RgbImage;
+
+use crate::{
+    camera::{self, Camera},
+    codes,
+    config::Background,
+    data::loader::{Cached, Draw},
+    error::{Error, Result},
+    model::{file::Tensors, generator::Generator},
+    parameters::Parameters,
+    region::{REGION_COUNT, Region, RegionSet},
+    render::{Outputs, RadianceField as _, RayBundle, RayOutput, Sampling, render_rays},
+    rng::Stream,
+    train::{
+        config::{TrainConfig, WarmupConfig},
+        events::Metrics,
+        losses,
+        optimiser::{Adam, Betas, Group},
+        preview,
+        trainer::{Inputs, StageRun},
+        whiten::whiten,
+    },
+};
+
+/// Resolution at which portraits are compared to find their first codes, pixels.
+const CODE_RESOLUTION: usize = 32;
+/// Weight of a mask value beside a colour value in that comparison (recipe).
+const CODE_MASK_WEIGHT: f32 = 0.7;
+/// Squared mask errors of small regions count more (recipe), in label order.
+const MASK_WEIGHTS: [f32; REGION_COUNT] = [1.0, 1.0, 3.0, 3.0, 3.0, 2.0, 2.0, 1.0, 1.0];
+/// Points of the eikonal loss are moved off the rays' samples by this, world units.
+const EIKONAL_SPREAD: f64 = 0.0036;
+/// A region counts as present in a portrait from this many pixels of its 32² mask on.
+const PRESENT_PIXELS: f32 = 1.5;
+
+/// Name of the codes in checkpoints.
+const CODES: &str = "codes";
+/// The first element of every stream drawn here.
+const STREAM: u64 = 0x7761_726d;
+
+/// The running stage.
+pub struct Warmup {
+    config: WarmupConfig,
+    seed: u64,
+    device: Device,
+    portraits: Cached,
+    mirror: bool,
+    generator: Generator,
+    log_alpha: Var,
+    /// z of every portrait, then of every mirrored one, `[M, D]`.
+    codes: Var,
+    /// Mean colour in [0, 1] of each region of each portrait, `[M, 9, 3]`; mirrored portraits share theirs.
+    region_colours: Tensor,
+    /// 1 where a region is present, `[M, 9]`.
+    present: Tensor,
+    optimiser: Adam,
+}
+
+impl Warmup {
+    /// Decodes the dataset and sets the codes to the portraits' whitened coordinates.
+    pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<Generator>) -> Result<Self> {
+        let stage = config.warmup.clone();
+        if config.model.field.background != Background::FarPlane {
+            let reason = "the warm-up ties the background to the far plane; set it to \"far_plane\"";
+            return Err(Error::config("model.field.background", reason));
+        }
+        let mut resolutions = vec![CODE_RESOLUTION, stage.resolutions[0], stage.resolutions[1]];
+        resolutions.sort_unstable();
+        resolutions.dedup();
+        let portraits = Cached::new(&inputs.dataset, &resolutions, &|_| ())?;
+        let generator = match start {
+            Some(start) => start.duplicate()?,
+            None => {
+                let model = crate::config::GeneratorConfig { upsampler: None, ..config.model.clone() };
+                Generator::new(&model, &Parameters::fresh(config.seed, DType::F32, &inputs.device))?
+            }
+        };
+        let all = draws(portraits.len(), config.mirror);
+        let (features, region_colours, present) = describe(&portraits, &all, &inputs.device)?;
+        let codes = Var::from_tensor(&whiten(&features, generator.config().field.style_dim, config.seed)?)?;
+
+        let under = |prefix: &str| generator.parameters().within(prefix).variables();
+        let (alpha, field): (Vec<_>, Vec<_>) = under("field").into_iter().partition(|(name, _)| name.ends_with("log_alpha"));
+        let log_alpha = alpha.into_iter().next().map(|(_, variable)| variable);
+        let log_alpha = log_alpha.ok_or_else(|| Error::shape("field.log_alpha", [1], &[]))?;
+        let group = |variables, learning_rate, bound| Group { variables, learning_rate, largest_gradient_norm: bound };
+        let groups = vec![
+            group(field, stage.learning_rate, Some(stage.gradient_bound)),
+            group(under("mapping"), stage.learning_rate, None),
+            group(vec![(CODES.to_owned(), codes.clone())], stage.code_learning_rate, None),
+        ];
+        let optimiser = Adam::new(groups, Betas { first: stage.betas[0], second: stage.betas[1] });
+        Ok(Self {
+            config: stage,
+            seed: config.seed,
+            device: inputs.device.clone(),
+            portraits,
+            mirror: config.mirror,
+            generator,
+            log_alpha,
+            codes,
+            region_colours,
+            present,
+            optimiser,
+        })
+    }
+
+    /// Rays of one step and what they should see.
+    fn draw(&self, step: usize, progress: f64) -> Result<Batch> {
+        let config = &self.config;
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64]);
+        let second = progress >= config.first_resolution_share;
+        let resolution = config.resolutions[usize::from(second)];
+        let level = self.portraits.level(resolution)?;
+        let all = draws(self.portraits.len(), self.mirror);
+        let order = random.permutation(all.len());
+        let batch = config.batch.min(all.len());
+        let rays = config.rays.min(resolution * resolution);
+
+        let (mut pixels, mut colours, mut masks) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut cameras, mut rows) = (Vec::new(), Vec::new());
+        for row in order.into_iter().take(batch) {
+            let draw = all[row];
+            rows.push(row as u32);
+            cameras.push(self.portraits.camera(draw).unwrap_or_default());
+            // Weighted draws without replacement: the largest u^(1/w) win (Efraimidis and Spirakis, 2006).
+            let mut keys: Vec<(f32, usize)> = Vec::with_capacity(resolution * resolution);
+            for pixel in 0..resolution * resolution {
+                let shares = level.pixel(draw, pixel % resolution, pixel / resolution).map_or([0; REGION_COUNT], |p| p.1);
+                let detail: f32 = shares[Region::Eyes.index()..=Region::Ears.index()].iter().map(|s| f32::from(*s)).sum();
+                let weight = 1.0 + config.detail_boost as f32 * detail / 255.0;
+                keys.push((random.uniform().max(1e-12).ln() / weight, pixel));
+            }
+            keys.select_nth_unstable_by(rays - 1, |left, right| right.0.total_cmp(&left.0));
+            let start = masks.len();
+            masks.resize(start + REGION_COUNT * rays, 0.0);
+            for (ray, (_, pixel)) in keys.iter().take(rays).enumerate() {
+                let (x, y) = (pixel % resolution, pixel / resolution);
+                let jitter = config.pixel_jitter as f32;
+                pixels.push(x as f32 + 0.5 + random.range(-jitter, jitter));
+                pixels.push(y as f32 + 0.5 + random.range(-jitter, jitter));
+                let (colour, shares) = level.pixel(draw, x, y).unwrap_or_default();
+                colours.extend(colour.map(|value| f32::from(value) / 255.0));
+                for (region, share) in shares.into_iter().enumerate() {
+                    masks[start + region * rays + ray] = f32::from(share) / 255.0;
+                }
+            }
+        }
+        let device = &self.device;
+        Ok(Batch {
+            resolution,
+            rows: Tensor::from_vec(rows, batch, device)?,
+            cameras: Camera::parameter_tensor(&cameras, device)?,
+            pixels: Tensor::from_vec(pixels, (batch, rays, 2), device)?,
+            colours: Tensor::from_vec(colours, (batch, rays, 3), device)?.transpose(1, 2)?.contiguous()?,
+            masks: Tensor::from_vec(masks, (batch, REGION_COUNT, rays), device)?,
+            random,
+        })
+    }
+
+    fn losses(&self, batch: &mut Batch) -> Result<(Tensor, Metrics)> {
+        let config = &self.config;
+        let weights = &config.weights;
+        let z = self.codes.as_tensor().index_select(&batch.rows, 0)?;
+        let field = self.generator.field().portraits(&codes::broadcast(&self.generator.map(&z)?)?)?;
+        let rays = camera::cast(&batch.cameras, &batch.pixels, batch.resolution, camera::FIELD_OF_VIEW_RAD)?;
+        let bundle = RayBundle::new(rays)?;
+        let sampling = self.sampling();
+        let (count, ray_count) = bundle.dimensions()?;
+        let depths = sampling.perturbed(count, ray_count, &mut batch.random, DType::F32, &self.device)?;
+        let outputs = Outputs { colour: true, ..Outputs::default() };
+        let output = render_rays(&field, &bundle, &depths, &sampling, outputs, RegionSet::ALL)?;
+
+        let colour = ((&output.colour * 0.5)? + 0.5)?.sub(&batch.colours)?.abs()?.mean_all()?;
+        let mask_weights = Tensor::new(&MASK_WEIGHTS, &self.device)?.reshape((1, REGION_COUNT, 1))?;
+        let masks = (&output.masks - &batch.masks)?.sqr()?.broadcast_mul(&mask_weights)?.sum(1)?.mean_all()?;
+        let foreground = batch.masks.narrow(1, 0, 1)?.squeeze(1)?.affine(-1.0, 1.0)?;
+        let opacity = losses::opacity(&output.weights.remaining.affine(-1.0, 1.0)?, &foreground)?;
+        let minimal_surface = losses::minimal_surface(&output.evaluation.distance)?;
+        let fill = self.fill(batch, &output)?;
+        let points = self.eikonal_points(batch, &bundle.points(&depths)?)?;
+        let gradient = field.evaluate(&points, None, Outputs { gradient: true, ..Outputs::default() })?.gradient;
+        let gradient = gradient.ok_or_else(|| Error::config("gradient", "the field gave none"))?;
+        let eikonal = losses::eikonal(&gradient)?;
+        let code_norm = z.sqr()?.mean_all()?;
+
+        let mut metrics = Metrics::default();
+        let mut total = Tensor::zeros((), DType::F32, &self.device)?;
+        for (name, weight, loss) in [
+            ("colour", weights.colour, &colour),
+            ("masks", weights.masks, &masks),
+            ("opacity", weights.opacity, &opacity),
+            ("eikonal", weights.eikonal, &eikonal),
+            ("minimal_surface", weights.minimal_surface, &minimal_surface),
+            ("fill", weights.fill, &fill),
+            ("code_norm", weights.code_norm, &code_norm),
+        ] {
+            total = (total + (loss * weight)?)?;
+            metrics.push(name, f64::from(loss.to_scalar::<f32>()?));
+        }
+        Ok((total, metrics))
+    }
+
+    /// Colour a region would show where its mask is not, pulled to the region's mean colour: after a swap of shapes
+    /// the newly uncovered parts look like the region, not like noise.
+    fn fill(&self, batch: &Batch, output: &RayOutput) -> Result<Tensor> {
+        let evaluation = &output.evaluation;
+        let Some(colours) = &evaluation.colours else { return Err(Error::config("fill", "the field gave no colours")) };
+        let volume = colours.dim(1)?;
+        let first = REGION_COUNT - volume;
+        let weights = crate::render::RayWeights {
+            weights: output.weights.weights.detach(),
+            remaining: output.weights.remaining.detach(),
+        };
+        let shown = weights.sum(&candle_nn::ops::sigmoid(colours)?)?; // [B, k, 3, R]
+        let light = weights.weights.sum(2)?; // [B, R]
+        let rows = &batch.rows;
+        let mean = self.region_colours.index_select(rows, 0)?.narrow(1, first, volume)?.unsqueeze(3)?; // [B, k, 3, 1]
+        let present = self.present.index_select(rows, 0)?.narrow(1, first, volume)?.unsqueeze(2)?; // [B, k, 1]
+        let wanted = mean.broadcast_mul(&light.unsqueeze(1)?.unsqueeze(1)?)?;
+        let off = (shown - wanted)?.abs()?.mean(2)?; // [B, k, R]
+        let outside = batch.masks.narrow(1, first, volume)?.affine(-1.0, 1.0)?;
+        let weight = outside.broadcast_mul(&light.unsqueeze(1)?)?.broadcast_mul(&present)?;
+        Ok((off * weight)?.mean_all()?)
+    }
+
+    /// Some of the samples `[B, N, 3]`, moved a little at random.
+    fn eikonal_points(&self, batch: &mut Batch, points: &Tensor) -> Result<Tensor> {
+        let (portraits, available, _) = points.dims3()?;
+        let count = ((available as f64 * self.config.eikonal_share) as usize).clamp(1, available);
+        let chosen: Vec<u32> = (0..count).map(|_| batch.random.below(available) as u32).collect();
+        let chosen = points.detach().index_select(&Tensor::from_vec(chosen, count, &self.device)?, 1)?;
+        let noise = batch.random.normal_tensor(&[portraits, count, 3], &self.device)?;
+        Ok((chosen + (noise * EIKONAL_SPREAD)?)?)
+    }
+
+    fn sampling(&self) -> Sampling {
+        let [near, far] = self.config.depth_range;
+        let samples = self.config.samples;
+        Sampling { near, far, last_interval: Some((far - near) / samples as f64), ..Sampling::behind_the_surface(samples) }
+    }
+
+    fn set_alpha(&self, progress: f64) -> Result<()> {
+        let [from, to] = self.config.alpha;
+        let moved = (progress / self.config.alpha_hold.max(1e-9)).min(1.0);
+        let log_alpha = from.ln() + (to.ln() - from.ln()) * moved;
+        Ok(self.log_alpha.set(&Tensor::full(log_alpha as f32, self.log_alpha.shape(), &self.device)?)?)
+    }
+}
+
+struct Batch {
+    resolution: usize,
+    rows: Tensor,
+    cameras: Tensor,
+    /// `[B, R, 2]`
+    pixels: Tensor,
+    /// `[B, 3, R]` in [0, 1]
+    colours: Tensor,
+    /// `[B, 9, R]`
+    masks: Tensor,
+    random: Stream,
+}
+
+impl StageRun for Warmup {
+    fn step(&mut self, step: usize) -> Result<Metrics> {
+        let progress = step as f64 / self.config.steps as f64;
+        self.set_alpha(progress)?;
+        let mut batch = self.draw(step, progress)?;
+        let (loss, mut metrics) = self.losses(&mut batch)?;
+        if let Some(quantity) = metrics.first_not_finite() {
+            return Err(Error::not_finite(format!("loss term {quantity}")));
+        }
+        let factor = self.config.schedule.factor(step, self.config.steps);
+        let norms = self.optimiser.step(&loss.backward()?, factor)?;
+        metrics.push("gradient_norm", norms.first().copied().unwrap_or(0.0));
+        Ok(metrics)
+    }
+
+    fn save(&self, tensors: &mut Tensors) -> Result<()> {
+        tensors.extend(self.generator.parameters().snapshot()?);
+        tensors.insert(CODES.to_owned(), self.codes.as_tensor().clone());
+        self.optimiser.save("adam", tensors)
+    }
+
+    fn load(&mut self, tensors: &Tensors) -> Result<()> {
+        self.generator.parameters().restore(tensors)?;
+        let codes = tensors.get(CODES).ok_or_else(|| Error::shape(CODES, self.codes.dims(), &[]))?;
+        if codes.dims() != self.codes.dims() {
+            return Err(Error::shape(CODES, self.codes.dims(), codes.dims()));
+        }
+        self.codes.set(&codes.to_device(&self.device)?)?;
+        self.optimiser.load("adam", tensors)
+    }
+
+    fn samples(&self) -> Result<RgbImage> {
+        let count = self.portraits.len().min(6);
+        let rows: Vec<u32> = (0..count).map(|index| (index * self.portraits.len() / count) as u32).collect();
+        let cameras: Vec<Camera> = rows
+            .iter()
+            .map(|row| self.portraits.camera(Draw { index: *row as usize, mirrored: false }).unwrap_or_default())
+            .collect();
+        let z = self.codes.as_tensor().index_select(&Tensor::from_vec(rows, count, &self.device)?, 0)?;
+        let trained = codes::broadcast(&self.generator.map(&z)?)?;
+        let measured = self.finished()?;
+        preview::grid(&measured, &trained, &cameras)
+    }
+
+    fn finished(&self) -> Result<Generator> {
+        let generator = self.generator.duplicate()?;
+        generator.measure(Some(self.codes.as_tensor()))?;
+        Ok(generator)
+    }
+
+    fn portrait_codes(&self) -> Option<Tensor> {
+        Some(self.codes.as_tensor().clone())
+    }
+}
+
+/// Every portrait, then every mirrored one.
+fn draws(count: usize, mirror: bool) -> Vec<Draw> {
+    let plain = (0..count).map(|index| Draw { index, mirrored: false });
+    let mirrored = (0..if mirror { count } else { 0 }).map(|index| Draw { index, mirrored: true });
+    plain.chain(mirrored).collect()
+}
+
+/// What first codes are computed from, `[M, F]`, and each region's mean colour `[M, 9, 3]` and presence `[M, 9]`.
+fn describe(portraits: &Cached, all: &[Draw], device: &Device) -> Result<(Tensor, Tensor, Tensor)> {
+    let level = portraits.level(CODE_RESOLUTION)?;
+    let (mut features, mut colours, mut present) = (Vec::new(), Vec::new(), Vec::new());
+    for draw in all {
+        let mut sums = [[0f32; 3]; REGION_COUNT];
+        let mut areas = [0f32; REGION_COUNT];
+        for pixel in 0..CODE_RESOLUTION * CODE_RESOLUTION {
+            let (x, y) = (pixel % CODE_RESOLUTION, pixel / CODE_RESOLUTION);
+            let (colour, shares) = level.pixel(*draw, x, y).unwrap_or_default();
+            let colour = colour.map(|value| f32::from(value) / 255.0);
+            features.extend(colour.map(|value| value - 0.5));
+            for (region, share) in shares.into_iter().enumerate() {
+                let share = f32::from(share) / 255.0;
+                features.push(CODE_MASK_WEIGHT * share);
+                areas[region] += share;
+                for channel in 0..3 {
+                    sums[region][channel] += share * colour[channel];
+                }
+            }
+        }
+        for (sum, area) in sums.iter().zip(areas) {
+            colours.extend(sum.map(|value| value / (area + 1e-3)));
+            present.push(f32::from(u8::from(area > PRESENT_PIXELS)));
+        }
+    }
+    let columns = CODE_RESOLUTION * CODE_RESOLUTION * (3 + REGION_COUNT);
+    Ok((
+        Tensor::from_vec(features, (all.len(), columns), device)?,
+        Tensor::from_vec(colours, (all.len(), REGION_COUNT, 3), device)?,
+        Tensor::from_vec(present, (all.len(), REGION_COUNT), device)?,
+    ))
+}
