@@ -1,8 +1,15 @@
 //! Losses, the trainer and its checkpoints.
 
 pub mod adversarial;
+pub mod average;
 pub mod checkpoint;
 pub mod config;
 pub mod events;
+pub mod field_stage;
 pub mod losses;
 pub mod optimiser;
+pub mod preview;
+pub mod trainer;
+pub mod upsampler_stage;
+pub mod warmup;
+pub mod whiten;

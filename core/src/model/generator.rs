@@ -193,8 +193,12 @@ impl Generator {
 
     /// z of a random portrait, `[1, D]`, a function of `seed`.
     pub fn draw_z(&self, seed: u64) -> Result<Tensor> {
+        self.spread(&Stream::new(seed, &[0x7a]).normal_tensor(&[1, self.config.field.style_dim], &self.device())?)
+    }
+
+    /// Standard normals `[B, D]` as z of this model's own mean and spread.
+    pub fn spread(&self, noise: &Tensor) -> Result<Tensor> {
         let (mean, deviation) = &self.z_statistics;
-        let noise = Stream::new(seed, &[0x7a]).normal_tensor(&[1, self.config.field.style_dim], &self.device())?;
         Ok(noise.broadcast_mul(deviation)?.broadcast_add(mean)?)
     }
 
@@ -223,9 +227,8 @@ impl Generator {
             set("z_mean", &mean)?;
             set("z_deviation", &variance.sqrt()?)?;
         }
-        let (mean, deviation) = &self.z_statistics;
         let noise = Stream::new(0, &[0x6d65]).normal_tensor(&[MEAN_DRAWS, self.config.field.style_dim], &self.device())?;
-        let w = self.map(&noise.broadcast_mul(deviation)?.broadcast_add(mean)?)?;
+        let w = self.map(&self.spread(&noise)?)?;
         set("w_mean", &w.mean(0)?)
     }
 

@@ -48,6 +48,21 @@ pub fn grid(generator: &Generator, trained: &Tensor, cameras: &[Camera]) -> Resu
     Ok(tile(&rows))
 }
 
+/// Random portraits: pictures, region maps, normals, a view from either side.
+pub fn random_grid(generator: &Generator) -> Result<RgbImage> {
+    const COUNT: u64 = 6;
+    let codes = (0..COUNT).map(|seed| generator.codes_from_seed(seed, 0.7)).collect::<Result<Vec<_>>>()?;
+    let codes = Tensor::cat(&codes, 0)?;
+    let at = |azimuth_rad: f64| Camera::parameter_tensor(&[Camera::at(azimuth_rad, 0.0); COUNT as usize], &generator.device());
+    let front = pictures(generator, &codes, &at(0.0)?)?;
+    let mut rows = vec![picture::from_tensor(&front.rgb)?, region_maps(&front)?];
+    rows.extend(normals(&front)?);
+    for side in [-SIDE_RAD, SIDE_RAD] {
+        rows.push(picture::from_tensor(&pictures(generator, &codes, &at(side)?)?.rgb)?);
+    }
+    Ok(tile(&rows))
+}
+
 fn pictures(generator: &Generator, codes: &Tensor, cameras: &Tensor) -> Result<Picture> {
     let mut settings = generator.render_settings();
     settings.normals = true;

@@ -7,10 +7,11 @@ use std::{
     fs::OpenOptions,
     io::Write as _,
     path::{Path, PathBuf},
+    sync::Arc,
     time::Instant,
 };
 
-use candle_core::Device;
+use candle_core::{Device, Tensor};
 use image::RgbImage;
 
 use crate::{
@@ -41,18 +42,57 @@ pub trait StageRun {
     fn load(&mut self, tensors: &Tensors) -> Result<()>;
     /// A grid of pictures that shows how far the stage is.
     fn samples(&self) -> Result<RgbImage>;
-    /// The generator as it would be shipped now.
-    fn finished(&self) -> Result<Generator>;
+    /// The generator as it would be shipped now, and what the next stage starts from.
+    fn finished(&self) -> Result<Start>;
 }
+
+/// What a stage starts from.
+#[derive(Clone)]
+pub struct Start {
+    /// Its weights are copied, never changed.
+    pub generator: Generator,
+    /// z of the training portraits, then of their mirrored copies, `[M, D]`, if they have codes.
+    pub portrait_codes: Option<Tensor>,
+}
+
+impl Start {
+    /// The model called `name` (see [`Generator::open`]) and, if it is a file beside which a warm-up left the training
+    /// portraits' codes, those.
+    pub fn open(name: &str, device: &Device) -> Result<Self> {
+        let generator = Generator::open(name, device)?;
+        let path = Path::new(name).with_file_name(CODES_FILE);
+        let portrait_codes = if Path::new(name).is_file() && path.is_file() {
+            let (mut tensors, _) = file::parse_safetensors(&path, &file::read_bytes(&path)?)?;
+            Some(tensors.remove(CODES).ok_or_else(|| Error::malformed(&path, "holds no portrait codes"))?.to_device(device)?)
+        } else {
+            None
+        };
+        Ok(Self { generator, portrait_codes })
+    }
+
+    fn save_codes(&self, run: &Path) -> Result<()> {
+        match &self.portrait_codes {
+            Some(codes) => {
+                let tensors = Tensors::from([(CODES.to_owned(), codes.clone())]);
+                file::write_safetensors(&run.join(CODES_FILE), &tensors, &[])
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// Where a run keeps the training portraits' codes.
+const CODES_FILE: &str = "codes.safetensors";
+const CODES: &str = "codes";
 
 /// What a run needs besides its configuration.
 pub struct Inputs {
     /// Portraits, masks and cameras.
-    pub dataset: Dataset,
+    pub dataset: Arc<Dataset>,
     /// Perceptual features for the losses that use them.
     pub perceptual: Option<Perceptual>,
     /// A model to start from instead of fresh weights.
-    pub start: Option<Generator>,
+    pub start: Option<Start>,
     /// Where to compute.
     pub device: Device,
 }
@@ -65,7 +105,7 @@ pub struct Trainer {
     stages: Vec<Stage>,
     checkpoints: Checkpoints,
     current: Option<Current>,
-    finished: Option<Generator>,
+    finished: Option<Start>,
     last_checkpoint: Option<PathBuf>,
 }
 
@@ -93,6 +133,11 @@ impl Trainer {
             let position = trainer.stages.iter().position(|known| *known == header.stage).ok_or_else(|| {
                 Error::malformed(&path, format!("was written by stage {:?}, which this run does not have", header.stage))
             })?;
+            if position > 0 {
+                // The stages before are done: their result lies in the run's folder.
+                let path = run.join("model.safetensors");
+                trainer.finished = Some(Start::open(&path.to_string_lossy(), &trainer.inputs.device)?);
+            }
             let mut current = trainer.begin(position)?;
             current.stage.load(&tensors)?;
             current.step = header.step;
@@ -164,11 +209,12 @@ impl Trainer {
 
     /// Ends a stage: the next one begins from its result, or the model is written.
     fn advance(&mut self, current: Current) -> Result<Vec<Event>> {
-        let generator = current.stage.finished()?;
+        let finished = current.stage.finished()?;
         let path = self.run.join("model.safetensors");
-        generator.save(&path, &format!("{:?}", self.config.preset).to_lowercase(), &self.provenance(current.position))?;
+        finished.save_codes(&self.run)?;
+        finished.generator.save(&path, &format!("{:?}", self.config.preset).to_lowercase(), &self.provenance(current.position))?;
         let events = vec![Event::Model(path)];
-        self.finished = Some(generator);
+        self.finished = Some(finished);
         if current.position + 1 < self.stages.len() {
             self.current = Some(self.begin(current.position + 1)?);
         }
@@ -177,6 +223,7 @@ impl Trainer {
 
     fn begin(&mut self, position: usize) -> Result<Current> {
         let start = self.finished.take().or_else(|| self.inputs.start.clone());
+        let start = start.as_ref();
         let stage: Box<dyn StageRun> = match self.stages[position] {
             Stage::Warmup => Box::new(Warmup::new(&self.config, &self.inputs, start)?),
             Stage::Field => Box::new(FieldStage::new(&self.config, &self.inputs, start)?),

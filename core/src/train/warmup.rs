@@ -8,20 +8,23 @@ use crate::{
     camera::{self, Camera},
     codes,
     config::Background,
-    data::loader::{Cached, Draw},
+    data::{
+        loader::{Cached, Draw},
+        picture::signed,
+    },
     error::{Error, Result},
     model::{file::Tensors, generator::Generator},
     parameters::Parameters,
     region::{REGION_COUNT, Region, RegionSet},
-    render::{Outputs, RadianceField as _, RayBundle, RayOutput, Sampling, render_rays},
+    render::{Outputs, RadianceField as _, RayBundle, Sampling, render_rays},
     rng::Stream,
     train::{
         config::{TrainConfig, WarmupConfig},
         events::Metrics,
-        losses,
+        losses::{self, MINIMAL_SURFACE_SHARPNESS, RegionColours},
         optimiser::{Adam, Betas, Group},
         preview,
-        trainer::{Inputs, StageRun},
+        trainer::{Inputs, StageRun, Start},
         whiten::whiten,
     },
 };
@@ -31,7 +34,7 @@ const CODE_RESOLUTION: usize = 32;
 /// Weight of a mask value beside a colour value in that comparison (recipe).
 const CODE_MASK_WEIGHT: f32 = 0.7;
 /// Squared mask errors of small regions count more (recipe), in label order.
-const MASK_WEIGHTS: [f32; REGION_COUNT] = [1.0, 1.0, 3.0, 3.0, 3.0, 2.0, 2.0, 1.0, 1.0];
+const MASK_WEIGHTS: [f64; REGION_COUNT] = [1.0, 1.0, 3.0, 3.0, 3.0, 2.0, 2.0, 1.0, 1.0];
 /// Points of the eikonal loss are moved off the rays' samples by this, world units.
 const EIKONAL_SPREAD: f64 = 0.0036;
 /// A region counts as present in a portrait from this many pixels of its 32² mask on.
@@ -53,7 +56,7 @@ pub struct Warmup {
     log_alpha: Var,
     /// z of every portrait, then of every mirrored one, `[M, D]`.
     codes: Var,
-    /// Mean colour in [0, 1] of each region of each portrait, `[M, 9, 3]`; mirrored portraits share theirs.
+    /// Mean colour in [-1, 1] of each region of each portrait, `[M, 9, 3]`; mirrored portraits share theirs.
     region_colours: Tensor,
     /// 1 where a region is present, `[M, 9]`.
     present: Tensor,
@@ -62,7 +65,7 @@ pub struct Warmup {
 
 impl Warmup {
     /// Decodes the dataset and sets the codes to the portraits' whitened coordinates.
-    pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<Generator>) -> Result<Self> {
+    pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>) -> Result<Self> {
         let stage = config.warmup.clone();
         if config.model.field.background != Background::FarPlane {
             let reason = "the warm-up ties the background to the far plane; set it to \"far_plane\"";
@@ -73,7 +76,7 @@ impl Warmup {
         resolutions.dedup();
         let portraits = Cached::new(&inputs.dataset, &resolutions, &|_| ())?;
         let generator = match start {
-            Some(start) => start.duplicate()?,
+            Some(start) => start.generator.with_upsampler(None, 0)?,
             None => {
                 let model = crate::config::GeneratorConfig { upsampler: None, ..config.model.clone() };
                 Generator::new(&model, &Parameters::fresh(config.seed, DType::F32, &inputs.device))?
@@ -144,7 +147,7 @@ impl Warmup {
                 pixels.push(x as f32 + 0.5 + random.range(-jitter, jitter));
                 pixels.push(y as f32 + 0.5 + random.range(-jitter, jitter));
                 let (colour, shares) = level.pixel(draw, x, y).unwrap_or_default();
-                colours.extend(colour.map(|value| f32::from(value) / 255.0));
+                colours.extend(colour.map(signed));
                 for (region, share) in shares.into_iter().enumerate() {
                     masks[start + region * rays + ray] = f32::from(share) / 255.0;
                 }
@@ -175,18 +178,18 @@ impl Warmup {
         let outputs = Outputs { colour: true, ..Outputs::default() };
         let output = render_rays(&field, &bundle, &depths, &sampling, outputs, RegionSet::ALL)?;
 
-        let colour = ((&output.colour * 0.5)? + 0.5)?.sub(&batch.colours)?.abs()?.mean_all()?;
-        let mask_weights = Tensor::new(&MASK_WEIGHTS, &self.device)?.reshape((1, REGION_COUNT, 1))?;
-        let masks = (&output.masks - &batch.masks)?.sqr()?.broadcast_mul(&mask_weights)?.sum(1)?.mean_all()?;
+        let colour = losses::colour_l1(&output.colour, &batch.colours)?;
+        let masks = losses::masks_l2(&output.masks, &batch.masks, &MASK_WEIGHTS)?;
         let foreground = batch.masks.narrow(1, 0, 1)?.squeeze(1)?.affine(-1.0, 1.0)?;
         let opacity = losses::opacity(&output.weights.remaining.affine(-1.0, 1.0)?, &foreground)?;
-        let minimal_surface = losses::minimal_surface(&output.evaluation.distance)?;
-        let fill = self.fill(batch, &output)?;
+        let minimal_surface = losses::minimal_surface(&output.evaluation.distance, MINIMAL_SURFACE_SHARPNESS)?;
+        let colours = output.evaluation.colours.as_ref().ok_or_else(|| Error::config("fill", "the field gave no colours"))?;
+        let fill = losses::fill(colours, &output.weights, &self.region_colours(batch, colours.dim(1)?)?)?;
         let points = self.eikonal_points(batch, &bundle.points(&depths)?)?;
         let gradient = field.evaluate(&points, None, Outputs { gradient: true, ..Outputs::default() })?.gradient;
         let gradient = gradient.ok_or_else(|| Error::config("gradient", "the field gave none"))?;
         let eikonal = losses::eikonal(&gradient)?;
-        let code_norm = z.sqr()?.mean_all()?;
+        let code_norm = losses::latent(&z)?;
 
         let mut metrics = Metrics::default();
         let mut total = Tensor::zeros((), DType::F32, &self.device)?;
@@ -205,27 +208,14 @@ impl Warmup {
         Ok((total, metrics))
     }
 
-    /// Colour a region would show where its mask is not, pulled to the region's mean colour: after a swap of shapes
-    /// the newly uncovered parts look like the region, not like noise.
-    fn fill(&self, batch: &Batch, output: &RayOutput) -> Result<Tensor> {
-        let evaluation = &output.evaluation;
-        let Some(colours) = &evaluation.colours else { return Err(Error::config("fill", "the field gave no colours")) };
-        let volume = colours.dim(1)?;
+    /// The regions' mean colours and masks for the fill loss.
+    fn region_colours(&self, batch: &Batch, volume: usize) -> Result<RegionColours> {
         let first = REGION_COUNT - volume;
-        let weights = crate::render::RayWeights {
-            weights: output.weights.weights.detach(),
-            remaining: output.weights.remaining.detach(),
-        };
-        let shown = weights.sum(&candle_nn::ops::sigmoid(colours)?)?; // [B, k, 3, R]
-        let light = weights.weights.sum(2)?; // [B, R]
-        let rows = &batch.rows;
-        let mean = self.region_colours.index_select(rows, 0)?.narrow(1, first, volume)?.unsqueeze(3)?; // [B, k, 3, 1]
-        let present = self.present.index_select(rows, 0)?.narrow(1, first, volume)?.unsqueeze(2)?; // [B, k, 1]
-        let wanted = mean.broadcast_mul(&light.unsqueeze(1)?.unsqueeze(1)?)?;
-        let off = (shown - wanted)?.abs()?.mean(2)?; // [B, k, R]
-        let outside = batch.masks.narrow(1, first, volume)?.affine(-1.0, 1.0)?;
-        let weight = outside.broadcast_mul(&light.unsqueeze(1)?)?.broadcast_mul(&present)?;
-        Ok((off * weight)?.mean_all()?)
+        Ok(RegionColours {
+            mean: self.region_colours.index_select(&batch.rows, 0)?.narrow(1, first, volume)?,
+            present: self.present.index_select(&batch.rows, 0)?.narrow(1, first, volume)?,
+            masks: batch.masks.narrow(1, first, volume)?,
+        })
     }
 
     /// Some of the samples `[B, N, 3]`, moved a little at random.
@@ -258,7 +248,7 @@ struct Batch {
     cameras: Tensor,
     /// `[B, R, 2]`
     pixels: Tensor,
-    /// `[B, 3, R]` in [0, 1]
+    /// `[B, 3, R]` in [-1, 1]
     colours: Tensor,
     /// `[B, 9, R]`
     masks: Tensor,
@@ -305,18 +295,13 @@ impl StageRun for Warmup {
             .collect();
         let z = self.codes.as_tensor().index_select(&Tensor::from_vec(rows, count, &self.device)?, 0)?;
         let trained = codes::broadcast(&self.generator.map(&z)?)?;
-        let measured = self.finished()?;
-        preview::grid(&measured, &trained, &cameras)
+        preview::grid(&self.finished()?.generator, &trained, &cameras)
     }
 
-    fn finished(&self) -> Result<Generator> {
+    fn finished(&self) -> Result<Start> {
         let generator = self.generator.duplicate()?;
         generator.measure(Some(self.codes.as_tensor()))?;
-        Ok(generator)
-    }
-
-    fn portrait_codes(&self) -> Option<Tensor> {
-        Some(self.codes.as_tensor().clone())
+        Ok(Start { generator, portrait_codes: Some(self.codes.as_tensor().copy()?.detach()) })
     }
 }
 
@@ -337,8 +322,8 @@ fn describe(portraits: &Cached, all: &[Draw], device: &Device) -> Result<(Tensor
         for pixel in 0..CODE_RESOLUTION * CODE_RESOLUTION {
             let (x, y) = (pixel % CODE_RESOLUTION, pixel / CODE_RESOLUTION);
             let (colour, shares) = level.pixel(*draw, x, y).unwrap_or_default();
-            let colour = colour.map(|value| f32::from(value) / 255.0);
-            features.extend(colour.map(|value| value - 0.5));
+            let colour = colour.map(signed);
+            features.extend(colour.map(|value| 0.5 * value));
             for (region, share) in shares.into_iter().enumerate() {
                 let share = f32::from(share) / 255.0;
                 features.push(CODE_MASK_WEIGHT * share);

@@ -1,0 +1,329 @@
+//! Stage `field`: the paper's first stage. The field against the global discriminator (realness and view direction)
+//! and the semantic one (realness and class of one region), with decoupling, eikonal and minimal-surface losses.
+
+use std::sync::Arc;
+
+use candle_core::{DType, Device, Tensor};
+use image::RgbImage;
+
+use crate::{
+    camera::{self, Camera},
+    codes,
+    config::GeneratorConfig,
+    data::loader::{Batch, Loader, LoaderConfig},
+    error::{Error, Result},
+    eval::perceptual::Perceptual,
+    model::{
+        discriminator::{Discriminator, DiscriminatorConfig, DiscriminatorKind, class_labels, select_masks},
+        file::Tensors,
+        generator::Generator,
+    },
+    parameters::Parameters,
+    region::{Region, RegionSet},
+    render::{Outputs, RayBundle, RayOutput, RenderSettings, Sampling, render_rays},
+    rng::Stream,
+    train::{
+        adversarial::{Auxiliary, Pictures, R1Weights, discriminator_loss, generator_terms},
+        average::Average,
+        config::{FieldStageConfig, TrainConfig},
+        events::Metrics,
+        losses::{self, DecouplingRenders, MINIMAL_SURFACE_SHARPNESS},
+        optimiser::{Adam, Betas, Group},
+        preview,
+        trainer::{Inputs, StageRun, Start},
+    },
+};
+
+/// The first element of every stream drawn here.
+const STREAM: u64 = 0x6669_656c;
+
+/// The running stage.
+pub struct FieldStage {
+    config: FieldStageConfig,
+    seed: u64,
+    device: Device,
+    loader: Loader,
+    next_batch: usize,
+    inputs: (Arc<crate::data::dataset::Dataset>, LoaderConfig),
+    perceptual: Option<Perceptual>,
+    generator: Generator,
+    average: Average,
+    global: Discriminator,
+    semantic: Discriminator,
+    discriminators: Parameters,
+    generator_optimiser: Adam,
+    discriminator_optimiser: Adam,
+}
+
+/// Pictures the generator made up, with what they were made from.
+struct Fakes {
+    /// `[B, 3, r, r]`
+    image: Tensor,
+    /// `[B, 9, r, r]`
+    masks: Tensor,
+    /// Azimuth and elevation, `[B, 2]`.
+    angles_rad: Tensor,
+    output: RayOutput,
+}
+
+impl FieldStage {
+    /// Fresh discriminators; the generator from `start` or fresh.
+    pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>) -> Result<Self> {
+        let stage = config.field.clone();
+        let generator = match start {
+            Some(start) => start.generator.with_upsampler(None, 0)?,
+            None => {
+                let model = GeneratorConfig { upsampler: None, ..config.model.clone() };
+                Generator::new(&model, &Parameters::fresh(config.seed, DType::F32, &inputs.device))?
+            }
+        };
+        let discriminators = Parameters::fresh(config.seed, DType::F32, &inputs.device);
+        let discriminator = |kind, name: &str| {
+            let config = DiscriminatorConfig { kind, resolution: stage.resolution, channel_multiplier: stage.channel_multiplier };
+            Discriminator::new(&config, &discriminators.within(name))
+        };
+        let global = discriminator(DiscriminatorKind::Global, "global")?;
+        let semantic = discriminator(DiscriminatorKind::Semantic, "semantic")?;
+        let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
+        let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
+        let trained = ["field", "mapping"].iter().flat_map(|name| generator.parameters().within(name).variables());
+        let generator_optimiser = Adam::new(vec![group(trained.collect(), stage.generator_learning_rate)], betas);
+        let discriminator_optimiser =
+            Adam::new(vec![group(discriminators.variables(), stage.discriminator_learning_rate)], betas);
+        let loader_config = LoaderConfig {
+            resolutions: vec![stage.resolution],
+            batch: stage.batch,
+            mirror: config.mirror,
+            seed: config.seed,
+            ..LoaderConfig::default()
+        };
+        Ok(Self {
+            loader: Loader::new(Arc::clone(&inputs.dataset), &loader_config)?,
+            next_batch: 0,
+            inputs: (Arc::clone(&inputs.dataset), loader_config),
+            perceptual: inputs.perceptual.clone(),
+            average: Average::of(generator.parameters(), stage.average_half_life_images)?,
+            config: stage,
+            seed: config.seed,
+            device: inputs.device.clone(),
+            generator,
+            global,
+            semantic,
+            discriminators,
+            generator_optimiser,
+            discriminator_optimiser,
+        })
+    }
+
+    /// The real portraits of `step`; after a resume the loader starts where the run stopped.
+    fn real(&mut self, step: usize) -> Result<Batch> {
+        if step != self.next_batch {
+            self.loader = Loader::resume(Arc::clone(&self.inputs.0), &self.inputs.1, step as u64)?;
+        }
+        self.next_batch = step + 1;
+        self.loader.next_batch()
+    }
+
+    /// w of fresh portraits, `[B, D]`.
+    fn draw_w(&self, random: &mut Stream) -> Result<Tensor> {
+        let shape = [self.config.batch, self.generator.config().field.style_dim];
+        let z = random.normal_tensor(&shape, &self.device)?;
+        self.generator.map(&self.generator.spread(&z)?)
+    }
+
+    fn draw_cameras(&self, random: &mut Stream) -> Vec<Camera> {
+        let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
+        let mut draw = |deviation: f64| f64::from(random.normal()) * deviation;
+        (0..self.config.batch).map(|_| Camera::at(draw(azimuth), draw(elevation))).collect()
+    }
+
+    /// Renders codes `[B, 9, 2, D]`; with `outputs.gradient` for the eikonal loss.
+    fn render(&self, codes: &Tensor, cameras: &[Camera], outputs: Outputs, random: &mut Stream) -> Result<Fakes> {
+        let settings = RenderSettings { resolution: self.config.resolution, ..self.generator.render_settings() };
+        let sampling = Sampling { samples: self.config.samples, ..settings.sampling };
+        let sampling = match sampling.last_interval {
+            Some(_) => Sampling { last_interval: Some(sampling.interval()), ..sampling },
+            None => sampling,
+        };
+        let field = self.generator.field().portraits(codes)?;
+        let parameters = Camera::parameter_tensor(cameras, &self.device)?;
+        let pixels = camera::pixel_centres(settings.resolution, &self.device)?;
+        let rays = RayBundle::new(camera::cast(&parameters, &pixels, settings.resolution, settings.field_of_view_rad)?)?;
+        let (batch, count) = rays.dimensions()?;
+        let depths = sampling.perturbed(batch, count, random, DType::F32, &self.device)?;
+        let output = render_rays(&field, &rays, &depths, &sampling, outputs, RegionSet::ALL)?;
+        let picture = |rows: &Tensor| rows.reshape((batch, rows.dim(1)?, settings.resolution, settings.resolution));
+        Ok(Fakes {
+            image: picture(&output.colour)?,
+            masks: picture(&output.masks)?,
+            angles_rad: parameters.narrow(1, 0, 2)?,
+            output,
+        })
+    }
+
+    fn train_discriminators(&mut self, step: usize, metrics: &mut Metrics) -> Result<()> {
+        let real = self.real(step)?;
+        let level = real.at(self.config.resolution)?;
+        let (real_image, real_masks) = (level.images.to_device(&self.device)?, level.masks.to_device(&self.device)?);
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64, 0]);
+        let codes = self.draw_codes(&mut random)?;
+        let cameras = self.draw_cameras(&mut random);
+        let outputs = Outputs { colour: true, ..Outputs::default() };
+        let fakes = self.render(&codes.detach(), &cameras, outputs, &mut random)?;
+        let (fake_image, fake_masks) = (fakes.image.detach(), fakes.masks.detach());
+        let penalty = R1Weights { image: self.config.r1_image, masks: self.config.r1_mask };
+        let loss = discriminator_loss(
+            &self.global,
+            Pictures { image: &real_image, masks: &real_masks },
+            Pictures { image: &fake_image, masks: &fake_masks },
+            Auxiliary::View { angles_rad: &fakes.angles_rad, weight: self.config.view },
+            Some(penalty),
+        )?;
+        metrics.push("global", scalar(&loss.logistic)?);
+        let mut total = loss.total;
+        if self.config.semantic > 0.0 {
+            let regions = draw_regions(self.config.batch, &mut random);
+            let labels = class_labels(&regions, &self.device)?;
+            let loss = discriminator_loss(
+                &self.semantic,
+                Pictures { image: &real_image, masks: &select_masks(&real_masks, &regions)? },
+                Pictures { image: &fake_image, masks: &select_masks(&fake_masks, &regions)? },
+                Auxiliary::Class { labels: &labels, weight: 1.0 },
+                Some(penalty),
+            )?;
+            metrics.push("semantic", scalar(&loss.logistic)?);
+            total = (total + loss.total)?;
+        }
+        finite(metrics)?;
+        let norms = self.discriminator_optimiser.step(&total.backward()?, 1.0)?;
+        metrics.push("discriminator_norm", norms.iter().sum());
+        Ok(())
+    }
+
+    fn train_generator(&mut self, step: usize, metrics: &mut Metrics) -> Result<()> {
+        let config = &self.config;
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
+        let codes = self.draw_codes(&mut random)?;
+        let cameras = self.draw_cameras(&mut random);
+        let fakes = self.render(&codes, &cameras, Outputs { colour: true, gradient: true, ..Outputs::default() }, &mut random)?;
+        let pictures = Pictures { image: &fakes.image, masks: &fakes.masks };
+        let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
+        let terms = generator_terms(&self.global, pictures, view)?;
+        metrics.push("generator", scalar(&terms.adversarial)?);
+        let mut total = terms.total;
+        if config.semantic > 0.0 {
+            let regions = draw_regions(config.batch, &mut random);
+            let labels = class_labels(&regions, &self.device)?;
+            let masks = select_masks(&fakes.masks, &regions)?;
+            let pictures = Pictures { image: &fakes.image, masks: &masks };
+            let terms = generator_terms(&self.semantic, pictures, Auxiliary::Class { labels: &labels, weight: 1.0 })?;
+            metrics.push("generator_semantic", scalar(&terms.adversarial)?);
+            total = (total + (terms.total * config.semantic)?)?;
+        }
+        let gradient = fakes.output.evaluation.gradient.as_ref();
+        let eikonal = losses::eikonal(gradient.ok_or_else(|| Error::config("gradient", "the field gave none"))?)?;
+        let minimal_surface = losses::minimal_surface(&fakes.output.evaluation.distance, MINIMAL_SURFACE_SHARPNESS)?;
+        metrics.push("eikonal", scalar(&eikonal)?);
+        metrics.push("minimal_surface", scalar(&minimal_surface)?);
+        total = ((total + (eikonal * config.eikonal)?)? + (minimal_surface * config.minimal_surface)?)?;
+        if config.decoupling > 0.0 {
+            let decoupling = self.decoupling(&mut random)?;
+            metrics.push("decoupling", scalar(&decoupling)?);
+            total = (total + (decoupling * config.decoupling)?)?;
+        }
+        finite(metrics)?;
+        let norms = self.generator_optimiser.step(&total.backward()?, 1.0)?;
+        metrics.push("generator_norm", norms.iter().sum());
+        Ok(())
+    }
+
+    /// L_STD: two portraits' shape and texture rows, crossed and rendered from the same cameras.
+    fn decoupling(&self, random: &mut Stream) -> Result<Tensor> {
+        let first = codes::broadcast(&self.draw_w(random)?)?;
+        let second = codes::broadcast(&self.draw_w(random)?)?;
+        let cameras = self.draw_cameras(random);
+        let cross = |shape: &Tensor, texture: &Tensor| Tensor::cat(&[shape.narrow(2, 0, 1)?, texture.narrow(2, 1, 1)?], 2);
+        let outputs = Outputs { colour: true, ..Outputs::default() };
+        // The same rays for all four, so that masks differ by their codes alone.
+        let seed = random.bits();
+        let render = |codes: Tensor| self.render(&codes, &cameras, outputs, &mut Stream::new(seed, &[]));
+        let own = render(cross(&first, &first)?)?;
+        let other_texture = render(cross(&first, &second)?)?;
+        let other_shape = render(cross(&second, &first)?)?;
+        let other = render(cross(&second, &second)?)?;
+        let features = |image: &Tensor| match &self.perceptual {
+            Some(perceptual) => perceptual.features(image),
+            None => self.global.image_features(image),
+        };
+        let renders = DecouplingRenders {
+            masks: &own.masks,
+            masks_other_texture: &other_texture.masks,
+            picture: &own.image,
+            picture_other_shape: &other_shape.image,
+            picture_other_both: &other.image,
+        };
+        losses::shape_texture_decoupling(renders, features, self.config.decoupling_margin)
+    }
+
+    /// Codes of fresh portraits, mixed from two w with the configured chance.
+    fn draw_codes(&self, random: &mut Stream) -> Result<Tensor> {
+        let first = self.draw_w(random)?;
+        if random.chance(self.config.mixing as f32) {
+            let second = self.draw_w(random)?;
+            return codes::mix(&first, &second, random);
+        }
+        codes::broadcast(&first)
+    }
+}
+
+impl StageRun for FieldStage {
+    fn step(&mut self, step: usize) -> Result<Metrics> {
+        let mut metrics = Metrics::default();
+        self.train_discriminators(step, &mut metrics)?;
+        self.train_generator(step, &mut metrics)?;
+        self.average.update(self.generator.parameters(), self.config.batch)?;
+        Ok(metrics)
+    }
+
+    fn save(&self, tensors: &mut Tensors) -> Result<()> {
+        tensors.extend(self.generator.parameters().snapshot()?);
+        tensors.extend(self.discriminators.snapshot()?);
+        self.average.save(tensors);
+        self.generator_optimiser.save("adam_generator", tensors)?;
+        self.discriminator_optimiser.save("adam_discriminator", tensors)
+    }
+
+    fn load(&mut self, tensors: &Tensors) -> Result<()> {
+        self.generator.parameters().restore(tensors)?;
+        self.discriminators.restore(tensors)?;
+        self.average.load(tensors)?;
+        self.generator_optimiser.load("adam_generator", tensors)?;
+        self.discriminator_optimiser.load("adam_discriminator", tensors)
+    }
+
+    fn samples(&self) -> Result<RgbImage> {
+        preview::random_grid(&self.finished()?.generator)
+    }
+
+    fn finished(&self) -> Result<Start> {
+        let generator = self.generator.duplicate()?;
+        self.average.apply(generator.parameters())?;
+        generator.measure(None)?;
+        Ok(Start { generator, portrait_codes: None })
+    }
+}
+
+fn draw_regions(count: usize, random: &mut Stream) -> Vec<Region> {
+    (0..count).map(|_| Region::ALL[random.below(Region::ALL.len())]).collect()
+}
+
+fn scalar(loss: &Tensor) -> Result<f64> {
+    Ok(f64::from(loss.to_dtype(DType::F32)?.to_scalar::<f32>()?))
+}
+
+fn finite(metrics: &Metrics) -> Result<()> {
+    match metrics.first_not_finite() {
+        Some(quantity) => Err(Error::not_finite(format!("loss term {quantity}"))),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,380 @@
+//! Stage `upsampler`: the field frozen, the 2D generator learns to lift its renders.
+//!
+//! Two teachers, mixed by their weights: the portrait a training code belongs to (shared/recipe: every warmed-up
+//! portrait's soft render is paired with its sharp photo; L1 and LPIPS on crops), and the high-resolution
+//! discriminator on random portraits (the paper's second stage).
+
+use std::sync::Arc;
+
+use candle_core::{DType, Device, Tensor};
+use image::RgbImage;
+
+use crate::{
+    camera::Camera,
+    codes,
+    data::{
+        dataset::Dataset,
+        loader::{Cached, Draw, Loader, LoaderConfig},
+    },
+    error::{Error, Result},
+    eval::perceptual::Perceptual,
+    model::{
+        discriminator::{Discriminator, DiscriminatorConfig, DiscriminatorKind},
+        file::Tensors,
+        generator::Generator,
+        upsampler::UpsamplerOutput,
+    },
+    parameters::Parameters,
+    render::{Frame, RenderSettings, TwoPass},
+    rng::Stream,
+    train::{
+        adversarial::{Auxiliary, Pictures, R1Weights, discriminator_loss, generator_terms},
+        average::Average,
+        config::{TrainConfig, UpsamplerStageConfig},
+        events::Metrics,
+        losses,
+        optimiser::{Adam, Betas, Group},
+        preview,
+        trainer::{Inputs, StageRun, Start},
+    },
+};
+
+/// The first element of every stream drawn here.
+const STREAM: u64 = 0x7570_7361;
+/// Renders of training portraits are kept up to this many; beyond it they are rendered each time they are needed.
+const MOST_KEPT: usize = 2_500;
+/// LPIPS sees each crop shifted by up to this, pixels: AlexNet's stride of 4 with crops on even offsets draws stripes.
+const LARGEST_SHIFT: usize = 3;
+
+/// The running stage.
+pub struct UpsamplerStage {
+    config: UpsamplerStageConfig,
+    seed: u64,
+    device: Device,
+    generator: Generator,
+    average: Average,
+    perceptual: Option<Perceptual>,
+    optimiser: Adam,
+    paired: Option<Paired>,
+    adversary: Option<Adversary>,
+}
+
+/// Training portraits with codes, and their renders.
+struct Paired {
+    portraits: Cached,
+    draws: Vec<Draw>,
+    codes: Tensor,
+    renders: Vec<Option<Render>>,
+    kept: usize,
+}
+
+/// A render as the upsampler reads it, f16: half the memory, and an error far below the renders' own.
+#[derive(Clone)]
+struct Render {
+    values: Tensor,
+    has_normal: bool,
+}
+
+struct Adversary {
+    discriminator: Discriminator,
+    parameters: Parameters,
+    optimiser: Adam,
+    loader: Loader,
+    next_batch: usize,
+    source: (Arc<Dataset>, LoaderConfig),
+}
+
+impl UpsamplerStage {
+    /// A fresh upsampler on the field of `start`, or the one it has if that is of the configured form.
+    pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>) -> Result<Self> {
+        let stage = config.upsampler.clone();
+        let start = start.ok_or_else(|| {
+            Error::config("--stage upsampler", "needs a trained field; pass --model RUN/model.safetensors or --stage all")
+        })?;
+        let wanted = config.model.upsampler.as_ref();
+        let wanted = wanted.ok_or_else(|| Error::config("model.upsampler", "this configuration has no upsampler to train"))?;
+        let generator = if start.generator.config().upsampler.as_ref() == Some(wanted) {
+            start.generator.duplicate()?
+        } else {
+            start.generator.with_upsampler(Some(wanted), config.seed)?
+        };
+        let resolution = wanted.output_resolution;
+        let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
+        let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
+        let variables = generator.parameters().within("upsampler").variables();
+        let optimiser = Adam::new(vec![group(variables, stage.learning_rate)], betas);
+
+        let paired = (stage.pixels > 0.0 || stage.perceptual > 0.0)
+            .then(|| Paired::new(config, inputs, start.portrait_codes.as_ref(), resolution))
+            .transpose()?;
+        if stage.perceptual > 0.0 && inputs.perceptual.is_none() {
+            let reason = "needs LPIPS weights; pass --lpips FILE, or --set upsampler.perceptual=0";
+            return Err(Error::config("upsampler.perceptual", reason));
+        }
+        let adversary = (stage.adversarial > 0.0)
+            .then(|| {
+                let parameters = Parameters::fresh(config.seed, DType::F32, &inputs.device);
+                let discriminator = DiscriminatorConfig {
+                    kind: DiscriminatorKind::HighResolution,
+                    resolution,
+                    channel_multiplier: stage.channel_multiplier,
+                };
+                let discriminator = Discriminator::new(&discriminator, &parameters.within("discriminator"))?;
+                let loader = LoaderConfig {
+                    resolutions: vec![resolution],
+                    batch: stage.batch,
+                    mirror: config.mirror,
+                    seed: config.seed,
+                    ..LoaderConfig::default()
+                };
+                Ok::<_, Error>(Adversary {
+                    optimiser: Adam::new(vec![group(parameters.variables(), stage.discriminator_learning_rate)], betas),
+                    discriminator,
+                    parameters,
+                    loader: Loader::new(Arc::clone(&inputs.dataset), &loader)?,
+                    next_batch: 0,
+                    source: (Arc::clone(&inputs.dataset), loader),
+                })
+            })
+            .transpose()?;
+        Ok(Self {
+            average: Average::of(&generator.parameters().within("upsampler"), stage.average_half_life_images)?,
+            config: stage,
+            seed: config.seed,
+            device: inputs.device.clone(),
+            generator,
+            perceptual: inputs.perceptual.clone(),
+            optimiser,
+            paired,
+            adversary,
+        })
+    }
+
+    /// Losses against the portraits that training codes belong to.
+    fn paired_loss(&mut self, step: usize, metrics: &mut Metrics) -> Result<Option<Tensor>> {
+        let Some(paired) = &mut self.paired else { return Ok(None) };
+        let config = &self.config;
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64, 0]);
+        let render_resolution = self.generator.render_resolution();
+        let factor = self.generator.output_resolution() / render_resolution;
+        let rows = random.permutation(paired.draws.len());
+        let rows = &rows[..config.batch.min(rows.len())];
+        let crop = config.crop.min(render_resolution);
+        let left = random.below(render_resolution - crop + 1);
+        let top = random.below(render_resolution - crop + 1);
+        let frames = rows.iter().map(|row| paired.render(&self.generator, *row)).collect::<Result<Vec<_>>>()?;
+        let frame = Render::batch(&frames, &self.device)?.crop(left, top, crop)?;
+        let draws: Vec<Draw> = rows.iter().map(|row| paired.draws[*row]).collect();
+        let resolution = self.generator.output_resolution();
+        let batch = paired.portraits.batch(step as u64, &draws)?;
+        let target = batch.at(resolution)?.images.to_device(&self.device)?;
+        let target = target.narrow(2, top * factor, crop * factor)?.narrow(3, left * factor, crop * factor)?.contiguous()?;
+        let rows: Vec<u32> = rows.iter().map(|row| *row as u32).collect();
+        let z = paired.codes.index_select(&Tensor::from_vec(rows, frames.len(), &self.device)?, 0)?;
+        let codes = codes::broadcast(&self.generator.map(&z)?.detach())?;
+        let output = self.generator.upsample(&frame, &codes, None)?;
+
+        let pixels = (losses::colour_l1(&output.rgb, &target)? * 2.0)?;
+        metrics.push("pixels", scalar(&pixels)?);
+        let mut total = (&pixels * config.pixels)?;
+        if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0) {
+            let [x, y] = [random.below(LARGEST_SHIFT + 1), random.below(LARGEST_SHIFT + 1)];
+            let side = crop * factor;
+            let shifted = |t: &Tensor| t.narrow(2, y, side - LARGEST_SHIFT)?.narrow(3, x, side - LARGEST_SHIFT)?.contiguous();
+            let distance = perceptual.distance(&shifted(&output.rgb)?, &shifted(&target)?)?.mean_all()?;
+            metrics.push("perceptual", scalar(&distance)?);
+            total = (total + (distance * config.perceptual)?)?;
+        }
+        Ok(Some(total))
+    }
+
+    /// Trains the discriminator and returns the generator's adversarial loss.
+    fn adversarial_loss(&mut self, step: usize, metrics: &mut Metrics) -> Result<Option<Tensor>> {
+        let Some(mut adversary) = self.adversary.take() else { return Ok(None) };
+        let loss = self.judge(&mut adversary, step, metrics);
+        self.adversary = Some(adversary);
+        loss.map(Some)
+    }
+
+    fn judge(&self, adversary: &mut Adversary, step: usize, metrics: &mut Metrics) -> Result<Tensor> {
+        let config = &self.config;
+        if step != adversary.next_batch {
+            adversary.loader = Loader::resume(Arc::clone(&adversary.source.0), &adversary.source.1, step as u64)?;
+        }
+        adversary.next_batch = step + 1;
+        let real = adversary.loader.next_batch()?;
+        let real = real.at(self.generator.output_resolution())?;
+        let (real_image, real_masks) = (real.images.to_device(&self.device)?, real.masks.to_device(&self.device)?);
+        let fake = self.random_pictures(&mut Stream::new(self.seed, &[STREAM, step as u64, 1]))?;
+        let (image, masks) = (fake.rgb.detach(), fake.masks.detach());
+        let weights = R1Weights { image: config.r1_image, masks: config.r1_mask };
+        let penalty = step.is_multiple_of(config.r1_steps.max(1)).then(|| weights.every(config.r1_steps.max(1)));
+        let loss = discriminator_loss(
+            &adversary.discriminator,
+            Pictures { image: &real_image, masks: &real_masks },
+            Pictures { image: &image, masks: &masks },
+            Auxiliary::None,
+            penalty,
+        )?;
+        metrics.push("discriminator", scalar(&loss.logistic)?);
+        finite(metrics)?;
+        adversary.optimiser.step(&loss.total.backward()?, 1.0)?;
+        let pictures = Pictures { image: &fake.rgb, masks: &fake.masks };
+        let terms = generator_terms(&adversary.discriminator, pictures, Auxiliary::None)?;
+        metrics.push("adversarial", scalar(&terms.adversarial)?);
+        Ok((terms.total * config.adversarial)?)
+    }
+
+    /// Finished pictures of random portraits from random cameras; the field gets no gradient.
+    fn random_pictures(&self, random: &mut Stream) -> Result<UpsamplerOutput> {
+        let batch = self.config.batch;
+        let z = random.normal_tensor(&[batch, self.generator.config().field.style_dim], &self.device)?;
+        let codes = codes::broadcast(&self.generator.map(&self.generator.spread(&z)?)?.detach())?;
+        let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
+        let cameras: Vec<Camera> = (0..batch)
+            .map(|_| Camera::at(f64::from(random.normal()) * azimuth, f64::from(random.normal()) * elevation))
+            .collect();
+        let cameras = Camera::parameter_tensor(&cameras, &self.device)?;
+        let frame = self.generator.render(&codes, &cameras, &self.generator.render_settings())?;
+        self.generator.upsample(&frame, &codes, None)
+    }
+}
+
+impl Paired {
+    fn new(config: &TrainConfig, inputs: &Inputs, codes: Option<&Tensor>, resolution: usize) -> Result<Self> {
+        let count = inputs.dataset.len();
+        let draws: Vec<Draw> = [false, true][..if config.mirror { 2 } else { 1 }]
+            .iter()
+            .flat_map(|mirrored| (0..count).map(|index| Draw { index, mirrored: *mirrored }))
+            .collect();
+        let codes = codes.filter(|codes| codes.dim(0).is_ok_and(|rows| rows == draws.len())).ok_or_else(|| {
+            let reason = "pairs need the codes a warm-up on the same data left beside its model; \
+                          run --stage all, or --set upsampler.pixels=0 upsampler.perceptual=0";
+            Error::config("upsampler.pixels", reason)
+        })?;
+        let portraits = Cached::new(&inputs.dataset, &[resolution], &|_| ())?;
+        let renders = vec![None; draws.len()];
+        Ok(Self { portraits, draws, codes: codes.to_device(&inputs.device)?, renders, kept: 0 })
+    }
+
+    /// The render of a training portrait from its own camera.
+    fn render(&mut self, generator: &Generator, row: usize) -> Result<Render> {
+        if let Some(Some(render)) = self.renders.get(row) {
+            return Ok(render.clone());
+        }
+        let codes = codes::broadcast(&generator.map(&self.codes.narrow(0, row, 1)?)?)?;
+        let camera = self.portraits.camera(self.draws[row]).unwrap_or_default();
+        let cameras = Camera::parameter_tensor(&[camera], &generator.device())?;
+        let settings = RenderSettings { two_pass: Some(TwoPass::default()), ..generator.render_settings() };
+        let render = Render::of(&generator.render(&codes, &cameras, &settings)?)?;
+        if self.kept < MOST_KEPT {
+            self.kept += 1;
+            self.renders[row] = Some(render.clone());
+        }
+        Ok(render)
+    }
+}
+
+impl Render {
+    fn of(frame: &Frame) -> Result<Self> {
+        let features = frame.features.as_ref().ok_or_else(|| Error::config("features", "were not rendered"))?;
+        let mut parts = vec![&frame.colour, &frame.masks, &frame.depth, &frame.point, &frame.opacity, features];
+        parts.extend(frame.normal.as_ref());
+        let values = Tensor::cat(&parts, 1)?.to_dtype(DType::F16)?.detach();
+        Ok(Self { values, has_normal: frame.normal.is_some() })
+    }
+
+    /// The frame of several renders.
+    fn batch(renders: &[Self], device: &Device) -> Result<FrameBatch> {
+        let has_normal = renders.iter().all(|render| render.has_normal);
+        let values: Vec<&Tensor> = renders.iter().map(|render| &render.values).collect();
+        Ok(FrameBatch { values: Tensor::cat(&values, 0)?.to_device(device)?.to_dtype(DType::F32)?, has_normal })
+    }
+}
+
+struct FrameBatch {
+    values: Tensor,
+    has_normal: bool,
+}
+
+impl FrameBatch {
+    /// The square of `side` pixels from (`left`, `top`) of all renders.
+    fn crop(&self, left: usize, top: usize, side: usize) -> Result<Frame> {
+        let values = self.values.narrow(2, top, side)?.narrow(3, left, side)?;
+        let channels = values.dim(1)?;
+        let normals = if self.has_normal { 3 } else { 0 };
+        let part = |first: usize, count: usize| values.narrow(1, first, count)?.contiguous();
+        Ok(Frame {
+            colour: part(0, 3)?,
+            masks: part(3, 9)?,
+            depth: part(12, 1)?,
+            point: part(13, 3)?,
+            opacity: part(16, 1)?,
+            features: Some(part(17, channels - 17 - normals)?),
+            normal: if self.has_normal { Some(part(channels - 3, 3)?) } else { None },
+        })
+    }
+}
+
+impl StageRun for UpsamplerStage {
+    fn step(&mut self, step: usize) -> Result<Metrics> {
+        let mut metrics = Metrics::default();
+        let losses = [self.paired_loss(step, &mut metrics)?, self.adversarial_loss(step, &mut metrics)?];
+        let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
+        let total = total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
+        finite(&metrics)?;
+        let factor = self.config.schedule.factor(step, self.config.steps);
+        let norms = self.optimiser.step(&total.backward()?, factor)?;
+        metrics.push("gradient_norm", norms.iter().sum());
+        self.average.update(&self.generator.parameters().within("upsampler"), self.config.batch)?;
+        Ok(metrics)
+    }
+
+    fn save(&self, tensors: &mut Tensors) -> Result<()> {
+        tensors.extend(self.generator.parameters().snapshot()?);
+        self.average.save(tensors);
+        if let Some(adversary) = &self.adversary {
+            tensors.extend(adversary.parameters.snapshot()?);
+            adversary.optimiser.save("adam_discriminator", tensors)?;
+        }
+        self.optimiser.save("adam", tensors)
+    }
+
+    fn load(&mut self, tensors: &Tensors) -> Result<()> {
+        self.generator.parameters().restore(tensors)?;
+        self.average.load(tensors)?;
+        if let Some(adversary) = &mut self.adversary {
+            adversary.parameters.restore(tensors)?;
+            adversary.optimiser.load("adam_discriminator", tensors)?;
+        }
+        self.optimiser.load("adam", tensors)
+    }
+
+    fn samples(&self) -> Result<RgbImage> {
+        let finished = self.finished()?.generator;
+        let Some(paired) = &self.paired else { return preview::random_grid(&finished) };
+        let count = paired.portraits.len().min(6);
+        let rows: Vec<u32> = (0..count).map(|index| (index * paired.portraits.len() / count) as u32).collect();
+        let cameras: Vec<Camera> =
+            rows.iter().map(|row| paired.portraits.camera(paired.draws[*row as usize]).unwrap_or_default()).collect();
+        let z = paired.codes.index_select(&Tensor::from_vec(rows, count, &self.device)?, 0)?;
+        preview::grid(&finished, &codes::broadcast(&finished.map(&z)?)?, &cameras)
+    }
+
+    fn finished(&self) -> Result<Start> {
+        let generator = self.generator.duplicate()?;
+        self.average.apply(&generator.parameters().within("upsampler"))?;
+        Ok(Start { generator, portrait_codes: self.paired.as_ref().map(|paired| paired.codes.clone()) })
+    }
+}
+
+fn scalar(loss: &Tensor) -> Result<f64> {
+    Ok(f64::from(loss.to_dtype(DType::F32)?.to_scalar::<f32>()?))
+}
+
+fn finite(metrics: &Metrics) -> Result<()> {
+    match metrics.first_not_finite() {
+        Some(quantity) => Err(Error::not_finite(format!("loss term {quantity}"))),
+        None => Ok(()),
+    }
+}
