@@ -18,7 +18,7 @@ use cnerf_core::{
     train::{
         config::{Preset, Stage, TrainConfig},
         events::Event,
-        trainer::{Inputs, Trainer, steps},
+        trainer::{Inputs, Start, Trainer, steps},
     },
 };
 use serde::Serialize;
@@ -88,13 +88,13 @@ impl TrainArguments {
     /// Trains until done or interrupted.
     pub fn run(self, seed: Option<u64>, console: &Console) -> anyhow::Result<Outcome> {
         let config = self.resolve(seed)?;
-        let dataset = Dataset::open(&self.data)?;
+        let dataset = Arc::new(Dataset::open(&self.data)?);
         if self.dry_run {
             return self.dry_run(&config, dataset.len(), console);
         }
         let device = self.model.device()?;
-        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path)).transpose()?;
-        let start = self.model.model.as_ref().map(|name| Generator::open(name, &device)).transpose()?;
+        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &device)).transpose()?;
+        let start = self.model.model.as_ref().map(|name| Start::open(name, &device)).transpose()?;
         let inputs = Inputs { dataset, perceptual, start, device };
         let trainer = if self.resume {
             Trainer::resume(config, self.stage, inputs, &self.out)?

@@ -345,3 +345,88 @@ fn describe(portraits: &Cached, all: &[Draw], device: &Device) -> Result<(Tensor
         Tensor::from_vec(present, (all.len(), REGION_COUNT), device)?,
     ))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::{
+        data::{
+            dataset::{Dataset, DatasetWriter, EncodedItem, PhotoFormat},
+            labels::LabelMap,
+        },
+        train::config::Preset,
+    };
+
+    /// Discs of a random colour on a random ground: face in the middle, hair above, background around.
+    fn dataset(folder: &std::path::Path, count: usize) -> Arc<Dataset> {
+        let path = folder.join("data");
+        let mut writer = DatasetWriter::create(&path, false).unwrap();
+        for index in 0..count {
+            let mut random = Stream::new(index as u64, &[]);
+            let mut shade = || [random.below(256) as u8, random.below(256) as u8, random.below(256) as u8];
+            let (ground, skin, hair) = (shade(), shade(), shade());
+            let radius = 8.0 + (index % 5) as f32;
+            let region = |x: u32, y: u32| {
+                let inside = (x as f32 - 15.5).hypot(y as f32 - 15.5) < radius;
+                if !inside { 0 } else if y < 12 { Region::Hair as u8 } else { Region::Face as u8 }
+            };
+            let picture = RgbImage::from_fn(32, 32, |x, y| {
+                image::Rgb(match region(x, y) {
+                    0 => ground,
+                    1 => skin,
+                    _ => hair,
+                })
+            });
+            let labels = (0..32 * 32).map(|pixel| region(pixel % 32, pixel / 32)).collect();
+            let mask = LabelMap::new(32, 32, labels).unwrap();
+            let camera = Camera::at(0.1 * index as f64 - 0.4, 0.0);
+            writer.add(EncodedItem::new(&picture, Some(&mask), Some(camera), PhotoFormat::Png).unwrap()).unwrap();
+        }
+        writer.finish().unwrap();
+        Arc::new(Dataset::open(&path).unwrap())
+    }
+
+    fn stage(folder: &std::path::Path) -> Warmup {
+        let mut config = TrainConfig::preset(Preset::Tiny);
+        config.model.field.style_dim = 6;
+        let inputs = Inputs { dataset: dataset(folder, 9), perceptual: None, start: None, device: Device::Cpu };
+        Warmup::new(&config, &inputs, None).unwrap()
+    }
+
+    #[test]
+    fn every_groups_gradient_predicts_how_the_loss_falls() {
+        let folder = tempfile::tempdir().unwrap();
+        let stage = stage(folder.path());
+        let loss = |_: ()| {
+            let mut batch = stage.draw(3, 0.0).unwrap();
+            stage.losses(&mut batch).unwrap().0
+        };
+        let value = |loss: &Tensor| f64::from(loss.to_scalar::<f32>().unwrap());
+        let start = loss(());
+        let gradients = start.backward().unwrap();
+        let mut variables = stage.generator.parameters().variables();
+        variables.push((CODES.into(), stage.codes.clone()));
+        let mut checked = 0;
+        for (name, variable) in variables {
+            let Some(gradient) = gradients.get(&variable) else { continue };
+            let square = f64::from(gradient.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap());
+            let original = variable.as_tensor().copy().unwrap();
+            // A step that changes the loss by about 2e-3, above f32 rounding, but no longer than curvature allows.
+            let rate = (1e-3 / square).min(0.02 / square.sqrt());
+            if rate * square < 2e-4 {
+                continue;
+            }
+            let at = |sign: f64| {
+                variable.set(&(&original + (gradient * (sign * rate)).unwrap()).unwrap()).unwrap();
+                value(&loss(()))
+            };
+            let slope = (at(1.0) - at(-1.0)) / (2.0 * rate);
+            variable.set(&original).unwrap();
+            checked += 1;
+            assert!((slope / square - 1.0).abs() < 0.05, "{name}: predicted {square}, found {slope}");
+        }
+        assert!(checked >= 8, "only {checked} weights had a gradient worth checking");
+    }
+}
