@@ -1,7 +1,16 @@
 //! The commands. Each module holds a command's raw arguments, resolves them into settings, calls the libraries, and
 //! reports.
 
+mod convert;
+mod dataset;
+mod edit;
+mod export;
+mod generate;
+mod info;
+mod invert;
+mod render;
 mod shell;
+mod synth;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -23,8 +32,27 @@ pub struct Arguments {
 
 #[derive(Subcommand, Debug)]
 enum Command {
+    /// Make procedural cartoon portraits with masks and cameras
+    Synth(synth::SynthArguments),
+    /// Check, align or import a dataset
+    #[command(subcommand)]
+    Dataset(dataset::DatasetCommand),
     /// Train a model
     Train(Box<train::TrainArguments>),
+    /// Make random portraits
+    Generate(generate::GenerateArguments),
+    /// Turn photos into editable 3D portraits
+    Invert(Box<invert::InvertArguments>),
+    /// Change regions of a portrait: shape, texture or both
+    Edit(edit::EditArguments),
+    /// Render a portrait from several views
+    Render(render::RenderArguments),
+    /// Write a portrait's surface as a mesh
+    Export(export::ExportArguments),
+    /// Read the authors' PyTorch checkpoints
+    Convert(convert::ConvertArguments),
+    /// Say what a model, portrait or dataset holds
+    Info(info::InfoArguments),
     /// Print shell completions
     Completions(shell::CompletionsArguments),
     /// Print the manual page
@@ -35,7 +63,16 @@ enum Command {
 pub fn run(arguments: Arguments, console: &Console) -> anyhow::Result<Outcome> {
     let seed = arguments.global.seed;
     match arguments.command {
+        Command::Synth(synth) => synth.run(seed.unwrap_or(0), console),
+        Command::Dataset(dataset) => dataset.run(console),
         Command::Train(train) => train.run(seed, console),
+        Command::Generate(generate) => generate.run(console),
+        Command::Invert(invert) => invert.run(seed.unwrap_or(0), console),
+        Command::Edit(edit) => edit.run(seed, console),
+        Command::Render(render) => render.run(seed, console),
+        Command::Export(export) => export.run(console),
+        Command::Convert(convert) => convert.run(console),
+        Command::Info(info) => info.run(console),
         Command::Completions(completions) => completions.run(),
         Command::Man => shell::man(),
     }

@@ -4,6 +4,8 @@
 mod commands;
 mod console;
 mod options;
+mod portraits;
+mod views;
 
 use std::process::ExitCode;
 
