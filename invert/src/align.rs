@@ -146,7 +146,7 @@ fn bilinear(photo: &RgbImage, x: f64, y: f64) -> [f64; 3] {
 }
 
 /// An index mirrored at both edges of 0..length: -1 becomes 0, length becomes length - 1.
-fn mirrored(index: i64, length: u32) -> u32 {
+pub(crate) fn mirrored(index: i64, length: u32) -> u32 {
     let length = i64::from(length.max(1));
     let phase = index.rem_euclid(2 * length);
     phase.min(2 * length - 1 - phase) as u32

@@ -9,14 +9,6 @@ pub enum Error {
     /// The core library's error.
     #[error(transparent)]
     Core(#[from] cnerf_core::Error),
-    /// A photo could not be decoded.
-    #[error("{}: not a picture that can be read: {reason}", path.display())]
-    Photo {
-        /// The photo.
-        path: PathBuf,
-        /// The decoder's word.
-        reason: String,
-    },
     /// A photo has fewer pixels than any face needs.
     #[error("{}: {width}x{height} pixels are too few; a photo needs at least {least} on each side", path.display())]
     PhotoTooSmall {

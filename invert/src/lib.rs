@@ -6,7 +6,14 @@ pub mod config;
 pub mod detect;
 pub mod edit;
 pub mod error;
+pub mod events;
+pub mod inverter;
+pub mod objective;
+pub mod parser;
 pub mod photo;
+pub mod pivot;
 pub mod portrait;
+pub mod space;
+pub mod tune;
 
 pub use error::{Error, Result};

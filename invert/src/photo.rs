@@ -1,63 +1,138 @@
-//! Reading photos as cameras and phones write them: any common format, turned upright, within bounds.
+//! A photo brought into the models' frame: read, its face found and aligned, its region masks if somebody knows them.
 
-use std::{fs::File, io::BufReader, path::Path};
+use std::path::{Path, PathBuf};
 
-use image::{DynamicImage, GrayImage, ImageDecoder as _, ImageReader, Limits, RgbImage};
+use cnerf_core::{
+    camera::Camera,
+    data::{
+        labels::{LabelMap, LabelScheme},
+        picture,
+    },
+};
+use image::{GrayImage, Luma, RgbImage};
 
-use crate::error::{Error, Result};
+use crate::{
+    align::{self, Aligned, CropTransform},
+    detect,
+    error::{Error, Result},
+    parser::RegionParser,
+};
 
-/// Photos with more pixels on a side are refused before they are decoded.
-pub const LARGEST_SIDE: u32 = 16_384;
 /// Photos with fewer pixels on a side cannot hold a usable face.
 pub const SMALLEST_SIDE: u32 = 64;
-/// Memory a decoder may take, bytes; a 100-megapixel photo fits.
-const DECODER_MEMORY: u64 = 512 << 20;
+/// Largest label map read, bytes.
+const LARGEST_MASK_FILE: u64 = 64 << 20;
+/// A crop that lies beyond the photo by more than this share is worth a warning.
+const MUCH_PADDING: f64 = 0.15;
 
-/// Reads a photo upright: the EXIF orientation is applied and transparency is laid on mid grey.
-///
-/// Errors: the file cannot be opened, is no picture, has more than [`LARGEST_SIDE`] or fewer than [`SMALLEST_SIDE`]
-/// pixels on a side.
+/// How to look at a photo.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PhotoOptions {
+    /// Which face, largest first.
+    pub face: usize,
+    /// The photo is framed like the training portraits already: do not look for a face.
+    pub aligned: bool,
+    /// Azimuth and elevation of the camera, radians, in place of those read from the head pose.
+    pub pose: Option<[f64; 2]>,
+    /// A `cnerf-9` label map of the photo (of the photo itself, not of its crop).
+    pub mask: Option<PathBuf>,
+}
+
+/// What is inverted: a square portrait, where it came from, and what is known of it.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    /// The photo's name.
+    pub source: String,
+    /// The crop, its place in the photo and the first camera.
+    pub aligned: Aligned,
+    /// Region of every pixel of the crop, if known.
+    pub labels: Option<LabelMap>,
+    /// What the user should know, e.g. that there were several faces.
+    pub warnings: Vec<String>,
+}
+
+impl Subject {
+    /// Reads and aligns a photo at `size` x `size` pixels. Regions come from the label map in `options`, else from
+    /// `parser`, else are unknown.
+    ///
+    /// Errors: the photo or the label map cannot be used; see [`detect::choose`] for faces that are refused.
+    pub fn read(path: &Path, options: &PhotoOptions, parser: Option<&dyn RegionParser>, size: u32) -> Result<Self> {
+        let photo = read(path)?;
+        let mut warnings = Vec::new();
+        let mut aligned = if options.aligned {
+            if photo.width() != photo.height() {
+                warnings.push(format!("{}: not square; its centre is taken", path.display()));
+            }
+            align::already_aligned(&photo, size)?
+        } else {
+            let (face, count) = detect::choose(path, &photo, options.face)?;
+            if count > 1 {
+                let taken =
+                    if options.face == 0 { "the largest".to_owned() } else { format!("number {}", options.face) };
+                warnings.push(format!("{}: {count} faces found, {taken} is taken", path.display()));
+            }
+            align::align(&photo, &face, size)?
+        };
+        if aligned.padded > MUCH_PADDING {
+            let percent = 100.0 * aligned.padded;
+            warnings.push(format!("{}: {percent:.0} % of the crop lies beyond the photo, mirrored", path.display()));
+        }
+        if let Some([azimuth, elevation]) = options.pose {
+            aligned.camera = Camera { roll_rad: aligned.camera.roll_rad, ..Camera::at(azimuth, elevation) };
+        }
+        let labels = match (&options.mask, parser) {
+            (Some(mask), _) => Some(read_labels(mask, &photo, &aligned.transform, size)?),
+            (None, Some(parser)) => Some(parser.parse(&aligned.picture)?),
+            (None, None) => None,
+        };
+        Ok(Self { source: path.display().to_string(), aligned, labels, warnings })
+    }
+}
+
+/// Reads a photo upright; see [`picture::read`]. Refuses one with fewer than [`SMALLEST_SIDE`] pixels on a side.
 pub fn read(path: &Path) -> Result<RgbImage> {
-    let file = File::open(path).map_err(|error| Error::io(path, error))?;
-    let refuse = |reason: image::ImageError| Error::Photo { path: path.to_owned(), reason: reason.to_string() };
-    let mut reader =
-        ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(|error| Error::io(path, error))?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(LARGEST_SIDE);
-    limits.max_image_height = Some(LARGEST_SIDE);
-    limits.max_alloc = Some(DECODER_MEMORY);
-    reader.limits(limits);
-    let mut decoder = reader.into_decoder().map_err(refuse)?;
-    let orientation = decoder.orientation().map_err(refuse)?;
-    let mut photo = DynamicImage::from_decoder(decoder).map_err(refuse)?;
-    photo.apply_orientation(orientation);
-    let (width, height) = (photo.width(), photo.height());
+    let photo = picture::read(path)?;
+    let (width, height) = photo.dimensions();
     if width.min(height) < SMALLEST_SIDE {
         return Err(Error::PhotoTooSmall { path: path.to_owned(), width, height, least: SMALLEST_SIDE });
     }
-    Ok(if photo.color().has_alpha() { over_grey(&photo) } else { photo.into_rgb8() })
+    Ok(photo)
 }
 
 /// ITU-R BT.601 luma, as the detector was trained on.
 pub fn luma(photo: &RgbImage) -> GrayImage {
     GrayImage::from_fn(photo.width(), photo.height(), |x, y| {
         let [red, green, blue] = photo.get_pixel(x, y).0.map(u32::from);
-        image::Luma([((299 * red + 587 * green + 114 * blue + 500) / 1000) as u8])
+        Luma([((299 * red + 587 * green + 114 * blue + 500) / 1000) as u8])
     })
 }
 
-fn over_grey(photo: &DynamicImage) -> RgbImage {
-    const GREY: u32 = 128;
-    let photo = photo.to_rgba8();
-    RgbImage::from_fn(photo.width(), photo.height(), |x, y| {
-        let [red, green, blue, alpha] = photo.get_pixel(x, y).0.map(u32::from);
-        image::Rgb([red, green, blue].map(|value| ((value * alpha + GREY * (255 - alpha) + 127) / 255) as u8))
-    })
+/// A photo's label map cut as the photo is: the nearest label, mirrored beyond the edges. A map of another size than
+/// the photo's is stretched over it, if its proportions are the photo's.
+fn read_labels(path: &Path, photo: &RgbImage, transform: &CropTransform, size: u32) -> Result<LabelMap> {
+    let labels = LabelMap::decode(&picture::read_file(path, LARGEST_MASK_FILE)?, &LabelScheme::cnerf(), path)?;
+    let (width, height) = (f64::from(labels.width()), f64::from(labels.height()));
+    let scale = width / f64::from(photo.width());
+    if (height - scale * f64::from(photo.height())).abs() > 1.0 {
+        let (photo_width, photo_height) = photo.dimensions();
+        let reason = format!("{width}x{height} pixels, but the photo has {photo_width}x{photo_height}");
+        return Err(Error::malformed(path, reason));
+    }
+    let cut = (0..size * size).map(|index| {
+        let at = |step: u32| f64::from(2 * step + 1) / f64::from(size) - 1.0;
+        let (x, y) = transform.photo_point(at(index % size), at(index / size));
+        let column = align::mirrored((x * scale).floor() as i64, labels.width());
+        let row = align::mirrored((y * scale).floor() as i64, labels.height());
+        labels.labels().get((row * labels.width() + column) as usize).copied().unwrap_or(0)
+    });
+    Ok(LabelMap::new(size, size, cut.collect())?)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const ASTRONAUT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/photos/astronaut.png");
 
     #[test]
     fn refusals_name_the_file_and_the_fault() {
@@ -71,10 +146,25 @@ mod tests {
     }
 
     #[test]
-    fn transparency_is_laid_on_grey() {
+    fn label_maps_are_cut_as_the_photo_is() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("clear.png");
-        image::RgbaImage::from_pixel(64, 64, image::Rgba([255, 0, 0, 0])).save(&path).unwrap();
-        assert_eq!(read(&path).unwrap().get_pixel(3, 3).0, [128, 128, 128]);
+        let mask = folder.path().join("mask.png");
+        // Region 5 in the square around her nose at (225, 125), in a map of half the photo's size.
+        let map = GrayImage::from_fn(256, 256, |x, y| {
+            Luma([if (107..119).contains(&x) && (57..69).contains(&y) { 5 } else { 0 }])
+        });
+        map.save(&mask).unwrap();
+        let options = PhotoOptions { mask: Some(mask.clone()), pose: Some([0.1, -0.2]), ..PhotoOptions::default() };
+        let subject = Subject::read(Path::new(ASTRONAUT), &options, None, 128).unwrap();
+        let labels = subject.labels.unwrap();
+        let nose: Vec<usize> = (0..128 * 128).filter(|index| labels.labels()[*index] == 5).collect();
+        let mean = |of: fn(usize) -> usize| nose.iter().map(|index| of(*index) as f64).sum::<f64>() / nose.len() as f64;
+        assert!((mean(|index| index % 128) - 64.0).abs() < 6.0 && (mean(|index| index / 128) - 76.0).abs() < 8.0);
+        assert_eq!((subject.aligned.camera.azimuth_rad, subject.aligned.camera.elevation_rad), (0.1, -0.2));
+        assert!(subject.warnings.is_empty());
+
+        GrayImage::new(100, 256).save(&mask).unwrap();
+        let error = Subject::read(Path::new(ASTRONAUT), &options, None, 128).unwrap_err().to_string();
+        assert!(error.contains("mask.png") && error.contains("512x512"), "{error}");
     }
 }

@@ -3,7 +3,10 @@
 use std::{collections::BTreeMap, path::Path};
 
 use candle_core::{DType, Tensor};
-use cnerf_core::{Error as CoreError, model::file::Tensors};
+use cnerf_core::{
+    Error as CoreError,
+    model::{file::Tensors, generator::Generator},
+};
 
 use crate::error::{Error, Result};
 
@@ -75,6 +78,13 @@ impl Deltas {
             tuned.insert(name.clone(), (from + difference.to_device(from.device())?)?);
         }
         Ok(tuned)
+    }
+
+    /// A copy of `model` with these differences added.
+    pub fn generator(&self, model: &Generator) -> Result<Generator> {
+        let copy = model.duplicate()?;
+        copy.parameters().restore(&self.applied(&model.parameters().snapshot()?)?)?;
+        Ok(copy)
     }
 
     /// Tensors and scales as a portrait file keeps them.

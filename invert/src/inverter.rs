@@ -1,0 +1,265 @@
+//! The inverter: one optimiser step a call, from a subject to its portrait.
+
+use std::{collections::VecDeque, time::Instant};
+
+use candle_core::Tensor;
+use cnerf_core::{
+    camera::Camera,
+    data::{labels::LabelMap, picture},
+    eval::{
+        perceptual::Perceptual,
+        quality::{self, Agreement},
+    },
+    model::generator::{Generator, Picture},
+};
+use image::{Luma, RgbImage};
+
+use crate::{
+    config::InvertConfig,
+    error::Result,
+    events::Event,
+    objective::Target,
+    photo::Subject,
+    pivot::{Pivot, whole_picture},
+    portrait::{Deltas, Metrics, ModelName, Portrait},
+    tune::{Frozen, Tune},
+};
+
+/// Width and height of a portrait file's thumbnail, pixels.
+const THUMBNAIL: u32 = 96;
+/// How far the novel views of [`Panels`] are turned, radians.
+const NOVEL_VIEW_RAD: f64 = 0.4;
+/// Depth along the view axis shown as white and as black, world units.
+const DEPTH_SHOWN: [f64; 2] = [0.92, 1.08];
+
+/// An inversion under way.
+pub struct Inverter<'a> {
+    generator: &'a Generator,
+    perceptual: Option<&'a Perceptual>,
+    config: InvertConfig,
+    model: ModelName,
+    subject: Subject,
+    target: Target,
+    pivot: Pivot,
+    tune: Option<Tune>,
+    settled: bool,
+    pending: VecDeque<Event>,
+    seconds: f64,
+}
+
+/// A finished inversion.
+pub struct Inversion {
+    /// The portrait, to be saved.
+    pub portrait: Portrait,
+    /// Pictures of it, to be looked at.
+    pub panels: Panels,
+}
+
+/// Pictures of an inversion at the model's output resolution.
+pub struct Panels {
+    /// The aligned photo.
+    pub photo: RgbImage,
+    /// The pivot: the untuned model at the codes found.
+    pub pivot: RgbImage,
+    /// The portrait as it is in the file.
+    pub tuned: RgbImage,
+    /// Its regions.
+    pub regions: RgbImage,
+    /// Its depth, near is bright.
+    pub depth: RgbImage,
+    /// Seen from both sides.
+    pub novel: [RgbImage; 2],
+}
+
+impl<'a> Inverter<'a> {
+    /// Prepares the inversion of `subject`. `model_name` is what the user calls the model. `perceptual` adds a
+    /// perceptual loss and the LPIPS metric.
+    pub fn new(
+        generator: &'a Generator,
+        model_name: &str,
+        subject: Subject,
+        config: InvertConfig,
+        perceptual: Option<&'a Perceptual>,
+    ) -> Result<Self> {
+        let started = Instant::now();
+        config.validate()?;
+        let target = Target::new(&subject.aligned.picture, subject.labels.as_ref(), generator, perceptual)?;
+        let pivot = Pivot::new(generator, &subject.aligned.camera, &config)?;
+        let pending = subject.warnings.iter().cloned().map(Event::Warning).collect();
+        let model = ModelName { name: model_name.to_owned(), hash: generator.hash()? };
+        let seconds = started.elapsed().as_secs_f64();
+        let (tune, settled) = (None, false);
+        Ok(Self { generator, perceptual, config, model, subject, target, pivot, tune, settled, pending, seconds })
+    }
+
+    /// Does one step and says what happened; `None` when nothing is left to do.
+    pub fn step(&mut self) -> Result<Option<Event>> {
+        if let Some(event) = self.pending.pop_front() {
+            return Ok(Some(event));
+        }
+        let started = Instant::now();
+        let event = self.advance();
+        self.seconds += started.elapsed().as_secs_f64();
+        event
+    }
+
+    fn advance(&mut self) -> Result<Option<Event>> {
+        if !self.pivot.is_done() {
+            return Ok(Some(Event::Pivot(self.pivot.step(self.generator, &self.target)?)));
+        }
+        let tune = match &mut self.tune {
+            Some(tune) => tune,
+            None => {
+                let frozen =
+                    Frozen { codes: self.pivot.codes()?, global: self.pivot.global()?, camera: self.pivot.camera()? };
+                self.tune.insert(Tune::new(self.generator, frozen, &self.config)?)
+            }
+        };
+        if self.settled || tune.is_done() {
+            return Ok(None);
+        }
+        if tune.is_settled() {
+            self.settled = true;
+            return Ok(Some(Event::Settled { step: tune.steps_done() }));
+        }
+        Ok(Some(Event::Tune(tune.step(self.generator, self.pivot.space(), &self.target)?)))
+    }
+
+    /// The portrait as it stands; usually after [`Self::step`] has returned `None`.
+    pub fn finish(mut self) -> Result<Inversion> {
+        let started = Instant::now();
+        let (codes, global, camera) = (self.pivot.codes()?, self.pivot.global()?, self.pivot.camera()?);
+        let view = Camera::parameter_tensor(&[camera], &self.generator.device())?;
+        let show =
+            |generator: &Generator, view: &Tensor| whole_picture(generator, &codes, global.as_ref(), view, false);
+
+        let deltas = match &mut self.tune {
+            Some(tune) => {
+                let tuned = tune.best_weights(&self.target)?;
+                Deltas::between(&self.generator.parameters().snapshot()?, &tuned)?
+            }
+            None => Deltas::default(),
+        };
+        // Everything shown and measured is what the file gives back, rounding included.
+        let tuned = deltas.generator(self.generator)?;
+        let pivot_picture = show(self.generator, &view)?;
+        let picture = show(&tuned, &view)?;
+        let side = |turn: f64| -> Result<RgbImage> {
+            let turned = Camera { azimuth_rad: camera.azimuth_rad + turn, ..camera };
+            one_picture(&show(&tuned, &Camera::parameter_tensor(&[turned], &self.generator.device())?)?.rgb)
+        };
+        let tuned_rgb = one_picture(&picture.rgb)?;
+        let panels = Panels {
+            photo: one_picture(&self.target.output.colour)?,
+            pivot: one_picture(&pivot_picture.rgb)?,
+            regions: LabelMap::from_masks(&picture.masks.squeeze(0)?)?.colours(),
+            depth: depth_picture(&picture, tuned_rgb.width())?,
+            novel: [side(-NOVEL_VIEW_RAD)?, side(NOVEL_VIEW_RAD)?],
+            tuned: tuned_rgb,
+        };
+        let depth_drift = match &self.tune {
+            Some(tune) => tune.depth_drift(&tuned)?,
+            None => 0.0,
+        };
+        let metrics = Metrics {
+            pivot_psnr: psnr(&pivot_picture.rgb, &self.target.output.colour)?,
+            depth_drift,
+            steps_pivot: self.config.steps().pivot(),
+            steps_tune: self.tune.as_ref().map_or(0, Tune::steps_done),
+            ..self.measure(&picture)?
+        };
+        let metrics = Metrics { seconds: self.seconds + started.elapsed().as_secs_f64(), ..metrics };
+        let portrait = Portrait {
+            model: self.model,
+            source: self.subject.source,
+            crop: Some(self.subject.aligned.transform),
+            codes: codes.squeeze(0)?,
+            upsampler_code: global.map(|code| code.squeeze(0)).transpose()?,
+            camera,
+            deltas,
+            noise: Vec::new(),
+            thumbnail: picture::resize(&panels.tuned, THUMBNAIL, THUMBNAIL)?,
+            config: self.config,
+            metrics,
+            history: Vec::new(),
+        };
+        Ok(Inversion { portrait, panels })
+    }
+
+    fn measure(&self, picture: &Picture) -> Result<Metrics> {
+        let photo = &self.target.output.colour;
+        let rgb = picture.rgb.clamp(-1.0, 1.0)?;
+        let lpips = match self.perceptual {
+            Some(perceptual) => perceptual.distance(&rgb, photo)?.to_vec1::<f32>()?.first().copied().map(f64::from),
+            None => None,
+        };
+        let mask_miou = match &self.target.output.masks {
+            Some(known) => {
+                let mut agreement = Agreement::default();
+                agreement.add(
+                    &LabelMap::from_masks(&known.squeeze(0)?)?,
+                    &LabelMap::from_masks(&picture.masks.squeeze(0)?)?,
+                )?;
+                agreement.mean_iou()
+            }
+            None => None,
+        };
+        let ms_ssim = quality::ms_ssim(&rgb, photo)?.values.first().copied().unwrap_or(0.0);
+        Ok(Metrics { psnr: psnr(&rgb, photo)?, ms_ssim, lpips, mask_miou, ..Metrics::default() })
+    }
+}
+
+/// The tuned generator of a portrait, and its codes and camera as tensors: all that rendering it needs.
+pub struct Opened {
+    /// The model with the portrait's weights.
+    pub generator: Generator,
+    /// `[1, 9, 2, D]`.
+    pub codes: Tensor,
+    /// `[1, L]`.
+    pub global: Option<Tensor>,
+    /// The camera that saw the photo.
+    pub camera: Camera,
+}
+
+impl Opened {
+    /// Opens `portrait`, read from `path`, with the model it was made with.
+    pub fn new(portrait: &Portrait, path: &std::path::Path, model: &Generator) -> Result<Self> {
+        portrait.check_model(path, &model.hash()?)?;
+        let device = model.device();
+        let codes = portrait.codes.unsqueeze(0)?.to_device(&device)?;
+        model.field().film(&codes)?; // Refuses codes of another length before anything is rendered.
+        let global = portrait.upsampler_code.as_ref().map(|code| code.unsqueeze(0)?.to_device(&device)).transpose()?;
+        Ok(Self { generator: portrait.deltas.generator(model)?, codes, global, camera: portrait.camera })
+    }
+
+    /// The portrait's finished picture from `camera`.
+    pub fn picture(&self, camera: &Camera) -> Result<Picture> {
+        let view = Camera::parameter_tensor(&[*camera], &self.generator.device())?;
+        whole_picture(&self.generator, &self.codes, self.global.as_ref(), &view, false)
+    }
+}
+
+fn psnr(found: &Tensor, photo: &Tensor) -> Result<f64> {
+    Ok(quality::psnr(&found.clamp(-1.0, 1.0)?, photo)?.first().copied().unwrap_or(0.0))
+}
+
+pub(crate) fn one_picture(rgb: &Tensor) -> Result<RgbImage> {
+    let pictures = picture::from_tensor(rgb)?;
+    Ok(pictures.into_iter().next().ok_or_else(|| cnerf_core::Error::shape("picture", "[1, 3, H, W]", rgb.dims()))?)
+}
+
+/// Depth in grey, near is bright, enlarged to `side` x `side` pixels.
+fn depth_picture(picture: &Picture, side: u32) -> Result<RgbImage> {
+    let [near, far] = DEPTH_SHOWN;
+    let depth: Vec<Vec<f32>> = picture.frame.depth.squeeze(0)?.squeeze(0)?.to_vec2()?;
+    let resolution = depth.len() as u32;
+    let grey = image::GrayImage::from_fn(resolution, resolution, |x, y| {
+        let value = depth.get(y as usize).and_then(|row| row.get(x as usize)).copied().map_or(far, f64::from);
+        Luma([(255.0 * ((far - value) / (far - near)).clamp(0.0, 1.0)) as u8])
+    });
+    let grey = image::DynamicImage::ImageLuma8(grey).into_rgb8();
+    Ok(image::imageops::resize(&grey, side, side, image::imageops::FilterType::Triangle))
+}
+
+#[cfg(test)]
+pub(crate) mod tests;

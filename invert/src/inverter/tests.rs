@@ -1,0 +1,182 @@
+use std::path::Path;
+
+use candle_core::{DType, Device};
+use cnerf_core::{
+    codes::Aspect,
+    config::{FieldConfig, GeneratorConfig, UpsamplerConfig},
+    parameters::Parameters,
+    region::Region,
+};
+
+use super::*;
+use crate::{
+    align::{Aligned, CropTransform},
+    edit::{self, Edit, Source},
+    error::Error,
+};
+
+/// A generator of a few thousand weights whose portraits differ: 16 to 32 pixels, drawn from `seed`.
+pub fn small_generator(seed: u64) -> Generator {
+    let field = FieldConfig { style_dim: 16, width: 12, ..FieldConfig::ours() };
+    let upsampler = UpsamplerConfig {
+        input_resolution: 16,
+        output_resolution: 32,
+        channels: vec![8, 6],
+        blocks: vec![1, 1],
+        ..UpsamplerConfig::ours(16)
+    };
+    let config = GeneratorConfig { field, upsampler: Some(upsampler), camera_deviation_rad: [0.3, 0.15], samples: 8 };
+    let generator = Generator::new(&config, &Parameters::fresh(seed, DType::F32, &Device::Cpu)).unwrap();
+    // Fresh heads give a grey ball: larger ones give portraits that can be told apart.
+    let mut weights = generator.parameters().snapshot().unwrap();
+    for (name, factor) in [
+        ("field.colour.weight", 60.0),
+        ("field.mask.weight", 20.0),
+        ("field.film.weight", 3.0),
+        ("field.residual.weight", 8.0),
+    ] {
+        let weight = (&weights[name] * factor).unwrap();
+        weights.insert(name.into(), weight);
+    }
+    generator.parameters().restore(&weights).unwrap();
+    generator.measure(None).unwrap();
+    generator
+}
+
+/// A portrait the generator can make, as if it were a photo.
+fn subject(generator: &Generator, with_labels: bool) -> Subject {
+    let codes = generator.codes_from_seed(7, 1.0).unwrap();
+    let view = Camera::parameter_tensor(&[Camera::at(0.15, -0.05)], &Device::Cpu).unwrap();
+    let picture = whole_picture(generator, &codes, None, &view, false).unwrap();
+    let labels = LabelMap::from_masks(&picture.masks.squeeze(0).unwrap()).unwrap();
+    let picture = one_picture(&picture.rgb).unwrap();
+    let transform = CropTransform::whole(&picture);
+    Subject {
+        source: "made up".into(),
+        aligned: Aligned { picture, transform, camera: Camera::at(0.1, 0.0), padded: 0.0 },
+        labels: with_labels.then_some(labels),
+        warnings: vec!["something to know".into()],
+    }
+}
+
+fn config() -> InvertConfig {
+    InvertConfig { pivot_steps: Some(40), tune_steps: Some(15), ..InvertConfig::default() }
+}
+
+fn run(generator: &Generator, subject: Subject, config: InvertConfig) -> (Inversion, Vec<Event>) {
+    let mut inverter = Inverter::new(generator, "small", subject, config, None).unwrap();
+    let mut events = Vec::new();
+    while let Some(event) = inverter.step().unwrap() {
+        events.push(event);
+    }
+    (inverter.finish().unwrap(), events)
+}
+
+#[test]
+fn losses_fall_and_the_file_gives_back_what_was_measured() {
+    let generator = small_generator(3);
+    // Somebody another model made: this one's codes cannot reach them, tuning must help.
+    let subject = subject(&small_generator(11), true);
+    let photo = picture::to_tensor(&[subject.aligned.picture.clone()], &Device::Cpu).unwrap();
+    let view = Camera::parameter_tensor(&[subject.aligned.camera], &Device::Cpu).unwrap();
+    let mean = whole_picture(&generator, &generator.mean_codes().unwrap(), None, &view, false).unwrap();
+    let start = psnr(&mean.rgb, &photo).unwrap();
+
+    let before = generator.hash().unwrap();
+    let (inversion, events) = run(&generator, subject, config());
+    let metrics = &inversion.portrait.metrics;
+    assert_eq!(generator.hash().unwrap(), before, "the model itself is not tuned");
+    assert_eq!(events[0], Event::Warning("something to know".into()));
+    let steps = |kind: fn(&Event) -> bool| events.iter().filter(|event| kind(event)).count();
+    assert_eq!(steps(|event| matches!(event, Event::Pivot(_))), 40);
+    assert_eq!(steps(|event| matches!(event, Event::Tune(_))), 15);
+    println!("start {start:.2} dB, {metrics:?}");
+    assert!(metrics.pivot_psnr > start + 3.0, "{start} {metrics:?}");
+    assert!(metrics.psnr > metrics.pivot_psnr + 0.3, "{metrics:?}");
+    assert!(metrics.ms_ssim > 0.5 && metrics.mask_miou.is_some_and(|miou| miou > 0.1), "{metrics:?}");
+    assert!(metrics.depth_drift < 2e-3 && metrics.lpips.is_none(), "{metrics:?}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("made-up.cnerf");
+    inversion.portrait.save(&path).unwrap();
+    let read = Portrait::load(&path).unwrap();
+    let opened = Opened::new(&read, &path, &generator).unwrap();
+    let again = opened.picture(&read.camera).unwrap();
+    assert_eq!(one_picture(&again.rgb).unwrap(), inversion.panels.tuned);
+
+    let other = small_generator(4);
+    assert!(matches!(Opened::new(&read, &path, &other), Err(Error::WrongModel { .. })));
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes() {
+    let generator = small_generator(3);
+    let bytes = |seed| {
+        let config = InvertConfig { seed, pivot_steps: Some(12), tune_steps: Some(3), ..config() };
+        let (mut inversion, _) = run(&generator, subject(&generator, false), config);
+        inversion.portrait.metrics.seconds = 0.0;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.cnerf");
+        inversion.portrait.save(&path).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    assert_eq!(bytes(1), bytes(1));
+    assert_ne!(bytes(1), bytes(2));
+}
+
+#[test]
+fn a_fixed_camera_stays_and_no_tuning_leaves_no_deltas() {
+    let generator = small_generator(3);
+    let config = InvertConfig { fixed_camera: true, pivot_steps: Some(5), tune_steps: Some(0), ..config() };
+    let (inversion, _) = run(&generator, subject(&generator, false), config);
+    let camera = inversion.portrait.camera;
+    assert!((camera.azimuth_rad - 0.1).abs() < 1e-6 && camera.zoom == 1.0);
+    assert!(inversion.portrait.deltas.is_empty());
+    assert_eq!(inversion.portrait.metrics.depth_drift, 0.0);
+}
+
+#[test]
+fn texture_edits_move_no_depth_and_can_be_undone() {
+    let generator = small_generator(3);
+    let config = InvertConfig { pivot_steps: Some(10), tune_steps: Some(2), ..config() };
+    let (inversion, _) = run(&generator, subject(&generator, false), config);
+    let path = Path::new("a.cnerf");
+    let mut portrait = inversion.portrait;
+    let before = portrait.codes.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+
+    // A small model's regions lie anywhere: take the one that shows most.
+    let opened = Opened::new(&portrait, path, &generator).unwrap();
+    let labels = LabelMap::from_masks(&opened.picture(&portrait.camera).unwrap().masks.squeeze(0).unwrap()).unwrap();
+    let largest = Region::ALL.into_iter().skip(1).max_by_key(|region| labels.counts()[region.index()]).unwrap();
+    let texture = Edit { regions: largest.into(), aspect: Aspect::Texture, source: Source::Seed(3), amount: 1.0 };
+    let source = edit::source_codes(&generator, &texture.source, None).unwrap();
+    let edited = edit::apply(&mut portrait, path, &generator, &[(texture.clone(), source)]).unwrap();
+    assert_eq!(edited.change.depth_change, 0.0, "{:?}", edited.change);
+    assert!(edited.change.inside_change > 2.0 * edited.change.outside_change, "{:?}", edited.change);
+    assert_eq!(portrait.history.len(), 1);
+
+    let shape = Edit { regions: Region::Face.into(), aspect: Aspect::Shape, source: Source::Mean, amount: 0.7 };
+    let mean = edit::source_codes(&generator, &shape.source, None).unwrap();
+    let edited = edit::apply(&mut portrait, path, &generator, &[(shape, mean)]).unwrap();
+    assert!(edited.change.depth_change > 0.0);
+
+    portrait.undo(path).unwrap();
+    assert_eq!(portrait.undo(path).unwrap().edit, texture);
+    assert_eq!(portrait.codes.flatten_all().unwrap().to_vec1::<f32>().unwrap(), before);
+}
+
+#[test]
+fn senseless_edits_are_refused() {
+    let generator = small_generator(3);
+    let config = InvertConfig { pivot_steps: Some(1), tune_steps: Some(0), ..config() };
+    let (inversion, _) = run(&generator, subject(&generator, false), config);
+    let mut portrait = inversion.portrait;
+    let mut refuse = |edit: Edit| {
+        let source = edit::source_codes(&generator, &Source::Mean, None).unwrap();
+        edit::apply(&mut portrait, Path::new("a.cnerf"), &generator, &[(edit, source)]).unwrap_err().to_string()
+    };
+    let edit = Edit { regions: Region::Hair.into(), aspect: Aspect::Both, source: Source::Mean, amount: 1.0 };
+    assert!(refuse(Edit { amount: f64::NAN, ..edit.clone() }).contains("--amount"));
+    assert!(refuse(Edit { regions: Default::default(), ..edit }).contains("--region"));
+    assert!(portrait.history.is_empty());
+}

@@ -1,0 +1,215 @@
+//! The pivot: codes of all nine regions and the camera, found by descent on the picture they give.
+//!
+//! Coarse to fine: first one code for all rows and rays of the field alone, then every row free, then whole pictures
+//! at the output resolution. Codes live in whitened coordinates ([`CodeSpace`]), held to the model's distribution by
+//! their mean square and to one person by their spread around their mean.
+
+use candle_core::{Tensor, Var};
+use cnerf_core::{
+    camera::{CAMERA_PARAMETERS, Camera},
+    config::UpsamplerStyle,
+    model::generator::{Generator, Picture},
+    region::REGION_COUNT,
+    render::RenderSettings,
+    rng::Stream,
+    train::optimiser::{Adam, Betas, Group, Schedule},
+};
+
+use crate::{
+    config::{InvertConfig, PivotConfig, Steps},
+    error::Result,
+    events::StepReport,
+    objective::{self, Loss, PhotoWeights, Target},
+    space::CodeSpace,
+};
+
+/// The first element of every stream drawn here.
+const STREAM: u64 = 0x7069_766f;
+/// What the render under a whole picture counts beside the picture itself.
+const RENDER_SHARE: f64 = 0.5;
+const BETAS: Betas = Betas { first: 0.9, second: 0.99 };
+/// Rates fall over the second half of each phase.
+const SCHEDULE: Schedule = Schedule { warmup_steps: 5, hold: 0.5, floor: 0.1 };
+
+/// The running optimisation.
+pub struct Pivot {
+    config: PivotConfig,
+    steps: Steps,
+    seed: u64,
+    space: CodeSpace,
+    /// Whitened, one row for all, `[1, D]`.
+    shared: Var,
+    /// Whitened, `[18, D]`; row 2 i + j is aspect j of region i.
+    rows: Var,
+    /// Whitened global code of the upsampler, `[1, D]`, if it has one.
+    global: Option<Var>,
+    /// `[1, 6]`, see [`Camera::parameters`].
+    camera: Var,
+    first_camera: Tensor,
+    moves_camera: bool,
+    optimiser: Adam,
+    step: usize,
+}
+
+impl Pivot {
+    /// Starts at the model's mean portrait, seen by `camera`.
+    pub fn new(generator: &Generator, camera: &Camera, config: &InvertConfig) -> Result<Self> {
+        let space = CodeSpace::measure(generator)?;
+        let device = generator.device();
+        let zeros = |rows: usize| Var::zeros((rows, space.style_dim()), candle_core::DType::F32, &device);
+        let global = matches!(&generator.config().upsampler, Some(u) if u.style == UpsamplerStyle::Global);
+        let first_camera = Camera::parameter_tensor(&[*camera], &device)?;
+        let mut pivot = Self {
+            config: config.pivot.clone(),
+            steps: config.steps(),
+            seed: config.seed,
+            shared: zeros(1)?,
+            rows: zeros(2 * REGION_COUNT)?,
+            global: if global { Some(zeros(1)?) } else { None },
+            camera: Var::from_tensor(&first_camera)?,
+            first_camera,
+            moves_camera: !config.fixed_camera,
+            optimiser: Adam::new(Vec::new(), BETAS),
+            step: 0,
+            space,
+        };
+        pivot.optimiser = pivot.optimiser_of(pivot.shared.clone());
+        Ok(pivot)
+    }
+
+    /// Whether all steps are done.
+    pub fn is_done(&self) -> bool {
+        self.step >= self.steps.pivot()
+    }
+
+    /// The codes as they are now, `[1, 9, 2, D]`, without a graph.
+    pub fn codes(&self) -> Result<Tensor> {
+        Ok(self.live_codes()?.detach())
+    }
+
+    /// The upsampler's global code as it is now, `[1, D]`.
+    pub fn global(&self) -> Result<Option<Tensor>> {
+        Ok(self.live_global()?.map(|code| code.detach()))
+    }
+
+    /// The space the codes were optimised in.
+    pub fn space(&self) -> &CodeSpace {
+        &self.space
+    }
+
+    /// The camera as it is now.
+    pub fn camera(&self) -> Result<Camera> {
+        let values: Vec<f32> = self.camera.as_tensor().flatten_all()?.to_vec1()?;
+        let mut parameters = [0.0; CAMERA_PARAMETERS];
+        parameters.iter_mut().zip(&values).for_each(|(parameter, value)| *parameter = f64::from(*value));
+        Ok(Camera::from_parameters(parameters))
+    }
+
+    /// One step.
+    pub fn step(&mut self, generator: &Generator, target: &Target) -> Result<StepReport> {
+        if self.step == self.steps.shared {
+            self.rows.set(&self.shared.as_tensor().broadcast_as(self.rows.shape())?.contiguous()?)?;
+            self.optimiser = self.optimiser_of(self.rows.clone());
+        }
+        let whole = self.step >= self.steps.shared + self.steps.free;
+        let loss = if whole { self.whole_loss(generator, target)? } else { self.ray_loss(generator, target)? };
+        let total = (loss.total.clone() + self.regularisation()?)?;
+        let value = objective::scalar(&total)?;
+        if !value.is_finite() {
+            return Err(cnerf_core::Error::not_finite("the pivot's loss").into());
+        }
+        let (position, length) = self.position();
+        self.optimiser.step(&total.backward()?, SCHEDULE.factor(position, length))?;
+        self.step += 1;
+        Ok(StepReport { step: self.step, total: self.steps.pivot(), loss: value, psnr: loss.psnr() })
+    }
+
+    /// The step within the phase of the present optimiser, and that phase's length.
+    fn position(&self) -> (usize, usize) {
+        match self.step.checked_sub(self.steps.shared) {
+            Some(position) => (position, self.steps.free + self.steps.whole),
+            None => (self.step, self.steps.shared),
+        }
+    }
+
+    fn live_codes(&self) -> Result<Tensor> {
+        let rows = if self.step < self.steps.shared { &self.shared } else { &self.rows };
+        self.space.to_portrait(rows.as_tensor())
+    }
+
+    fn live_global(&self) -> Result<Option<Tensor>> {
+        self.global.as_ref().map(|code| self.space.to_codes(code.as_tensor())).transpose()
+    }
+
+    fn ray_loss(&self, generator: &Generator, target: &Target) -> Result<Loss> {
+        let mut random = Stream::new(self.seed, &[STREAM, self.step as u64]);
+        let level = &target.render;
+        let pixels = objective::draw_pixels(level.resolution, self.steps.rays, &mut random, &generator.device())?;
+        let field = generator.field().portraits(&self.live_codes()?)?;
+        let sampling = generator.render_settings().sampling;
+        let camera = self.camera.as_tensor();
+        let output = objective::render_pixels(&field, camera, &pixels, level.resolution, &sampling, &mut random)?;
+        objective::ray_loss(&output, level, &pixels, &self.weights())
+    }
+
+    fn whole_loss(&self, generator: &Generator, target: &Target) -> Result<Loss> {
+        let codes = self.live_codes()?;
+        let picture = whole_picture(generator, &codes, self.live_global()?.as_ref(), self.camera.as_tensor(), true)?;
+        whole_loss(&picture, target, &self.weights())
+    }
+
+    fn weights(&self) -> PhotoWeights {
+        let PivotConfig { absolute, squared, perceptual, masks, opacity, .. } = self.config;
+        PhotoWeights { absolute, squared, perceptual, masks, opacity }
+    }
+
+    fn regularisation(&self) -> Result<Tensor> {
+        let rows = if self.step < self.steps.shared { &self.shared } else { &self.rows }.as_tensor();
+        let mut total = (rows.sqr()?.mean_all()? * self.config.prior)?;
+        if rows.dim(0)? > 1 {
+            let spread = rows.broadcast_sub(&rows.mean_keepdim(0)?)?.sqr()?.mean_all()?;
+            total = (total + (spread * self.config.agreement)?)?;
+        }
+        if let Some(global) = &self.global {
+            total = (total + (global.as_tensor().sqr()?.mean_all()? * self.config.prior)?)?;
+        }
+        let [angle, shift, zoom] = self.config.camera_prior.map(|deviation| 1.0 / deviation.max(1e-6) as f32);
+        let scale = Tensor::new(&[[angle, angle, angle, shift, shift, zoom]], rows.device())?;
+        let moved = ((self.camera.as_tensor() - &self.first_camera)? * scale)?;
+        Ok((total + (moved.sqr()?.sum_all()? * self.config.camera)?)?)
+    }
+
+    fn optimiser_of(&self, codes: Var) -> Adam {
+        let mut variables = vec![("codes".to_owned(), codes)];
+        variables.extend(self.global.iter().map(|code| ("global".to_owned(), code.clone())));
+        let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
+        let mut groups = vec![group(variables, self.config.code_rate)];
+        if self.moves_camera {
+            groups.push(group(vec![("camera".to_owned(), self.camera.clone())], self.config.camera_rate));
+        }
+        Adam::new(groups, BETAS)
+    }
+}
+
+/// The finished picture of one portrait, with its graph if `differentiable`.
+pub fn whole_picture(
+    generator: &Generator,
+    codes: &Tensor,
+    global: Option<&Tensor>,
+    camera: &Tensor,
+    differentiable: bool,
+) -> Result<Picture> {
+    let settings = RenderSettings { differentiable, ..generator.render_settings() };
+    let frame = generator.render(codes, camera, &settings)?;
+    let lifted = generator.upsample(&frame, codes, global)?;
+    let (rgb, masks) =
+        if differentiable { (lifted.rgb, lifted.masks) } else { (lifted.rgb.detach(), lifted.masks.detach()) };
+    Ok(Picture { rgb, masks, frame })
+}
+
+/// The losses of a whole picture and of the render under it.
+pub fn whole_loss(picture: &Picture, target: &Target, weights: &PhotoWeights) -> Result<Loss> {
+    let finished = objective::picture_loss(&picture.rgb, target, weights)?;
+    let render = objective::frame_loss(&picture.frame, &target.render, weights)?;
+    Ok(Loss { total: (finished.total + (render.total * RENDER_SHARE)?)?, squared_error: finished.squared_error })
+}
