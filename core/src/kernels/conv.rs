@@ -73,7 +73,7 @@ pub fn conv2d_input_gradient(
     padding: usize,
 ) -> Result<Tensor> {
     let (batch, _, _, _) = grad_output.dims4()?;
-    let (_, channels, kernel_height, kernel_width) = weight.dims4()?;
+    let (_, channels, _, _) = weight.dims4()?;
     let input_shape = [batch, channels, input_size.0, input_size.1];
     let geometry = Geometry::new(&input_shape, weight.dims(), stride, padding)?;
     geometry.check_output("gradient of a convolution's output", grad_output)?;

@@ -6,6 +6,7 @@
 
 use std::borrow::Cow;
 use std::cell::RefCell;
+use std::mem::MaybeUninit;
 use std::ops::Range;
 
 use rayon::prelude::*;
@@ -15,10 +16,11 @@ use super::geometry::{Geometry, PaddedSource};
 use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Vector};
 
 /// Values of one strip: about half of a second-level cache of 1 MB, the rest is for weights and sums.
-const STRIP_VALUES: usize = 100_000;
-/// Values of the strip that one block of summands may touch per tile: they stay in the first-level cache while all
-/// output channels pass over them.
+const STRIP_VALUES: usize = 128_000;
+/// Values of the strip that one block of summands may touch per tile.
 const BLOCK_VALUES: usize = 6_000;
+/// Tiles that are summed together, so that weights are fetched from afar once for all of them.
+const TILES: usize = 4;
 
 /// The convolution of `input` by `weight`, row-major `[B, O, Ho, Wo]`.
 pub(super) fn forward(
@@ -84,18 +86,12 @@ pub(super) fn input_gradient(
                     );
                 }
             });
-            let mut weights = Vec::with_capacity(geometry.input_channels * offsets.len());
-            for c in 0..geometry.input_channels {
-                for o in 0..geometry.output_channels {
-                    let at = (o * geometry.input_channels + c) * geometry.taps();
-                    let kernel_of_pair = &weight[at..at + geometry.taps()];
-                    for (_, ky) in taps(0, row_phase) {
-                        weights.extend(taps(1, column_phase).map(|(_, kx)| kernel_of_pair[ky * kernel[1] + kx]));
-                    }
-                }
-            }
+            let selected: Vec<usize> = taps(0, row_phase)
+                .flat_map(|(_, ky)| taps(1, column_phase).map(move |(_, kx)| ky * kernel[1] + kx))
+                .collect();
+            let weights = Cow::Owned(transposed_weights(geometry, weight, &selected));
             let origin = [row_phase, column_phase].map(|phase| (stride * first + phase) as isize - padding as isize);
-            phases.push(Phase { weights: Cow::Owned(weights), offsets, origin });
+            phases.push(Phase { weights, offsets, origin });
         }
     }
     let plan = Plan { source, phases, step: stride, channels: geometry.input_channels, size };
@@ -124,6 +120,34 @@ fn channel_offsets(channels: usize, channel_size: usize, taps: impl Fn(&mut Vec<
     // A strip holds a single row of the grid before it could outgrow u32; 2^32 values in one row of all channels
     // would be 16 GB.
     (0..channels).flat_map(|c| of_one.iter().map(move |tap| (c * channel_size + tap) as u32)).collect()
+}
+
+/// The `selected` taps of a weight `[O, C, taps]` as `[C, O, selected]`.
+fn transposed_weights(geometry: &Geometry, weight: &[f32], selected: &[usize]) -> Vec<f32> {
+    let (inputs, outputs) = (geometry.input_channels, geometry.output_channels);
+    let row = outputs * selected.len();
+    let mut transposed = Vec::<f32>::with_capacity(inputs * row);
+    // A few input channels at a time: neighbours share the cache lines that are read.
+    const TOGETHER: usize = 16;
+    let chunks = transposed.spare_capacity_mut()[..inputs * row].par_chunks_mut((TOGETHER * row).max(1));
+    chunks.enumerate().for_each(|(chunk, rows)| {
+        for o in 0..outputs {
+            let from = &weight[(o * inputs + chunk * TOGETHER) * geometry.taps()..];
+            for (to, from) in rows.chunks_exact_mut(row).zip(from.chunks_exact(geometry.taps())) {
+                let to = &mut to[o * selected.len()..][..selected.len()];
+                match (to.first_chunk_mut::<9>(), from.first_chunk::<9>()) {
+                    // All of a 3 × 3 kernel, by far the commonest, in two or three moves.
+                    (Some(to), Some(from)) if selected.len() == 9 && geometry.taps() == 9 => {
+                        *to = from.map(MaybeUninit::new);
+                    }
+                    _ => to.iter_mut().zip(selected).for_each(|(to, &tap)| _ = to.write(from[tap])),
+                }
+            }
+        }
+    });
+    // SAFETY: every row has a run for every output channel, and each was written in full.
+    unsafe { transposed.set_len(inputs * row) };
+    transposed
 }
 
 /// A convolution laid out for the strips of `source`.
@@ -156,7 +180,23 @@ struct Scratch {
     pieces: Vec<Piece>,
 }
 
-/// Neighbouring positions of a tile that lie in one row of the result.
+/// Neighbouring positions of the padded grid, summed for all channels.
+#[derive(Clone)]
+struct Tile {
+    /// First position.
+    start: usize,
+    /// Number of vectors.
+    vectors: usize,
+    /// Where the sums of the first channel go: into the result if that is as contiguous as the tile, else aside.
+    out: *mut f32,
+    /// Distance from one channel's sums to the next.
+    out_stride: usize,
+    /// What is to be copied into the result afterwards.
+    pieces: Range<usize>,
+}
+
+/// Neighbouring positions of a tile that lie beside each other in the result.
+#[derive(Clone, Copy, Default, PartialEq, Eq)]
 struct Piece {
     /// First position in the tile.
     from: usize,
@@ -232,86 +272,129 @@ struct StripJob<'a> {
 impl tile::Job for StripJob<'_> {
     #[inline(always)]
     unsafe fn run<V: Vector>(self) {
-        let Self { plan, image, bias, rows, channels, result, scratch } = self;
+        let Self { plan, image, bias, rows, channels, result, scratch: Scratch { strip, sums, pieces } } = self;
         let source = &plan.source;
         let width = MOST_VECTORS * V::LANES;
-        source.fill(image, 0..source.channels, rows.clone(), width, &mut scratch.strip);
-        let sums_size = (channels.len() + MOST_ROWS) * width;
-        if scratch.sums.len() < sums_size {
-            scratch.sums.resize(sums_size, 0.0);
+        let strip = if source.is_in_place() {
+            image[rows.start * source.pitch()..].as_ptr()
+        } else {
+            source.fill(image, 0..source.channels, rows.clone(), width, strip);
+            strip.as_ptr()
+        };
+        let tile_sums = channels.len() * width;
+        if sums.len() < TILES * tile_sums {
+            sums.resize(TILES * tile_sums, 0.0);
         }
+        let channel_size = plan.size[0] * plan.size[1];
+        // SAFETY: `channels` starts inside the result.
+        let result = unsafe { result.0.add(channels.start * channel_size) };
 
         // Positions are numbered along the padded rows, so that tiles run on over the rows' ends; only where rows are
         // a whole number of vectors does each start its own tile, because then nothing is wasted.
         let (pitch, columns) = (source.pitch(), source.grid[1]);
         let all = (rows.len() - 1) * pitch + columns;
-        let by_row = rows.len() * columns.div_ceil(V::LANES) <= all.div_ceil(V::LANES);
+        let by_row = pitch > columns && rows.len() * columns.div_ceil(V::LANES) <= all.div_ceil(V::LANES);
         let (segments, length) = if by_row { (rows.len(), columns) } else { (1, all) };
+        // Tiles as equal as can be: four vectors are two and two, because a single one leaves the processor waiting.
+        let vectors = length.div_ceil(V::LANES);
+        let per_segment = vectors.div_ceil(MOST_VECTORS);
+
         for phase in &plan.phases {
-            for segment in 0..segments {
-                let mut at = 0;
-                while at < length {
-                    let vectors = (length - at).div_ceil(V::LANES).min(MOST_VECTORS);
-                    let positions = segment * pitch + at..segment * pitch + length.min(at + vectors * V::LANES);
-                    // SAFETY: the processor has V; the strip was filled for these rows with a tile of slack, the sums
-                    // have a row per channel and MOST_ROWS more, and weights are [channels, summands].
-                    unsafe { plan.sum_tile::<V>(phase, channels.clone(), positions.start, vectors, scratch) };
-                    plan.pieces(phase, rows.start, positions, &mut scratch.pieces);
-                    // SAFETY: the pieces lie inside the result's channels, and no other job has these rows and channels.
-                    unsafe { plan.write_tile(&channels, bias, scratch, width, result) };
-                    at += vectors * V::LANES;
+            let mut tile = 0;
+            while tile < segments * per_segment {
+                let count = TILES.min(segments * per_segment - tile);
+                let mut tiles =
+                    [const { Tile { start: 0, vectors: 0, out: std::ptr::null_mut(), out_stride: 0, pieces: 0..0 } }; TILES];
+                pieces.clear();
+                for (index, to) in tiles[..count].iter_mut().enumerate() {
+                    let (segment, part) = ((tile + index) / per_segment, (tile + index) % per_segment);
+                    let first = segment * pitch;
+                    let end = length.min((part + 1) * vectors / per_segment * V::LANES);
+                    let positions = first + part * vectors / per_segment * V::LANES..first + end;
+                    to.start = positions.start;
+                    to.vectors = positions.len().div_ceil(V::LANES);
+                    let first = pieces.len();
+                    plan.add_pieces(phase, rows.start, positions, pieces);
+                    let whole = Piece { from: 0, count: to.vectors * V::LANES, ..pieces.get(first).copied().unwrap_or_default() };
+                    if plan.step == 1 && pieces[first..] == [whole] {
+                        // SAFETY: a piece is inside the result's channel.
+                        to.out = unsafe { result.add(whole.to) };
+                        to.out_stride = channel_size;
+                        pieces.truncate(first);
+                    } else {
+                        to.out = sums[index * tile_sums..].as_mut_ptr();
+                        to.out_stride = width;
+                    }
+                    to.pieces = first..pieces.len();
                 }
+                // SAFETY: the processor has V. The strip was filled for these rows with a tile of slack, or is an image of
+                // whole vectors. Every tile's sums have a place for all channels, in `sums` or in the result, where no
+                // other job writes these rows and channels.
+                unsafe { plan.sum::<V>(phase, strip, &channels, bias, &tiles[..count]) };
+                for tile in &tiles[..count] {
+                    // SAFETY: the tile's sums were just written, and its pieces are inside the result's channels.
+                    unsafe { plan.copy(tile, &pieces[tile.pieces.clone()], channels.len(), result) };
+                }
+                tile += count;
             }
         }
     }
 }
 
 impl Plan<'_> {
-    /// All channels' sums over the tile that starts at `position`, in blocks of summands that stay in the first-level
-    /// cache.
+    /// The sums of `tiles` for all channels, in blocks of summands, so that a block's weights are fetched once for all
+    /// tiles and its part of the strip stays in the first-level cache.
     ///
     /// # Safety
-    /// The processor has `V`'s instruction set, `scratch.strip` is filled for the tile and `scratch.sums` has room
-    /// for `channels` rounded up to whole products.
+    /// The processor has `V`'s instruction set, the strip can be read at all tiles, and each tile's `out` can be written
+    /// for all channels.
     #[inline(always)]
-    unsafe fn sum_tile<V: Vector>(
+    unsafe fn sum<V: Vector>(
         &self,
         phase: &Phase<'_>,
-        channels: Range<usize>,
-        position: usize,
-        vectors: usize,
-        scratch: &mut Scratch,
+        strip: *const f32,
+        channels: &Range<usize>,
+        bias: Option<&[f32]>,
+        tiles: &[Tile],
     ) {
         let summands = phase.offsets.len();
         let taps = (summands / self.source.channels).max(1);
-        let block = (BLOCK_VALUES / (MOST_VECTORS * V::LANES * self.source.kernel[0])).max(1) * taps;
-        let width = MOST_VECTORS * V::LANES;
+        let tile_values = MOST_VECTORS * V::LANES * self.source.kernel[0];
+        let block = (BLOCK_VALUES / tile_values).max(1) * taps;
         let mut first = 0;
         loop {
             let last = (first + block).min(summands);
             let mut channel = channels.start;
             while channel < channels.end {
                 let height = tile::rows_of_next::<V>(channels.end - channel);
-                // SAFETY: `channel` is clamped to the weights' rows, `first` to their length; positions by the caller.
+                let stored = height.min(channels.end - channel);
+                // SAFETY: `channel + m` is clamped to the weights' rows and `first..last` to their length; the bias has
+                // a value per channel; tiles by the caller.
                 unsafe {
-                    let row = |m: usize| (channel + m).min(channels.end - 1) * summands + first;
-                    let weights = phase.weights.as_ptr();
-                    let mut rows = [weights; MOST_ROWS];
-                    for (m, start) in rows.iter_mut().enumerate() {
-                        *start = weights.add(row(m));
+                    let mut rows = [phase.weights.as_ptr(); MOST_ROWS];
+                    let mut initial = [0.0; MOST_ROWS];
+                    for m in 0..MOST_ROWS {
+                        let channel = channel + m.min(stored - 1);
+                        rows[m] = rows[m].add(channel * summands + first);
+                        if let Some(bias) = bias {
+                            initial[m] = *bias.get_unchecked(channel);
+                        }
                     }
-                    let product = Product {
-                        rows,
-                        row_step: 0,
-                        columns: scratch.strip.as_ptr().add(position),
-                        column_step: 0,
-                        offsets: phase.offsets.get_unchecked(first..last),
-                        repetitions: 1,
-                        out: scratch.sums.as_mut_ptr().add((channel - channels.start) * width),
-                        out_stride: width,
-                        accumulate: first > 0,
-                    };
-                    tile::multiply::<V>(height, vectors, &product);
+                    for tile in tiles {
+                        let product = Product {
+                            rows,
+                            row_step: 0,
+                            columns: strip.add(tile.start),
+                            column_step: 0,
+                            offsets: phase.offsets.get_unchecked(first..last),
+                            repetitions: 1,
+                            out: tile.out.add((channel - channels.start) * tile.out_stride),
+                            out_stride: tile.out_stride,
+                            stored,
+                            initial: (first == 0).then_some(initial),
+                        };
+                        tile::multiply::<V>(height, tile.vectors, &product);
+                    }
                 }
                 channel += height;
             }
@@ -322,14 +405,14 @@ impl Plan<'_> {
         }
     }
 
-    /// Where the tile's `positions` go in a channel of the result; positions in the padding go nowhere.
-    fn pieces(&self, phase: &Phase<'_>, first_row: usize, positions: Range<usize>, pieces: &mut Vec<Piece>) {
-        pieces.clear();
+    /// Where the values at `positions` go in a channel of the result; those in the padding go nowhere.
+    fn add_pieces(&self, phase: &Phase<'_>, first_row: usize, positions: Range<usize>, pieces: &mut Vec<Piece>) {
         let step = self.step as isize;
         let [height, width] = self.size.map(|size| size as isize);
         // Grid columns whose place in the result is inside it.
         let begin = (step - 1 - phase.origin[1]).div_euclid(step).max(0);
         let end = ((width - 1 - phase.origin[1]).div_euclid(step) + 1).min(self.source.grid[1] as isize);
+        let others = pieces.len();
         let mut at = positions.start;
         while at < positions.end {
             let (row, column) = (at / self.source.pitch(), at % self.source.pitch());
@@ -338,48 +421,49 @@ impl Plan<'_> {
             let from = (column as isize).max(begin);
             let until = ((column + next - at) as isize).min(end);
             if (0..height).contains(&to_row) && from < until {
-                pieces.push(Piece {
+                let piece = Piece {
                     from: (at - positions.start) + (from as usize - column),
                     to: (to_row * width + step * from + phase.origin[1]) as usize,
                     count: (until - from) as usize,
-                });
+                };
+                match pieces[others..].last_mut() {
+                    Some(last) if last.is_continued_by(&piece, self.step) => last.count += piece.count,
+                    _ => pieces.push(piece),
+                }
             }
             at = next;
         }
     }
 
-    /// Copies the tile's sums to their places, adding the bias.
+    /// Copies `pieces` of a tile that was summed aside to their places in `channels` channels of the result.
     ///
     /// # Safety
-    /// `result` is writable for all channels, nobody else writes these pieces, and the sums are those of `channels`.
+    /// The pieces are inside the tile, and inside the result's channels, which nobody else writes at these places.
     #[inline(always)]
-    unsafe fn write_tile(
-        &self,
-        channels: &Range<usize>,
-        bias: Option<&[f32]>,
-        scratch: &Scratch,
-        width: usize,
-        result: SharedOutput,
-    ) {
+    unsafe fn copy(&self, tile: &Tile, pieces: &[Piece], channels: usize, result: *mut f32) {
         let channel_size = self.size[0] * self.size[1];
-        for channel in channels.clone() {
-            let bias = bias.map_or(0.0, |bias| bias[channel]);
-            for piece in &scratch.pieces {
-                // SAFETY: `pieces` keeps every piece inside the tile and inside the result's channel.
+        for channel in 0..channels {
+            for piece in pieces {
+                // SAFETY: the caller vouches for both places.
                 unsafe {
-                    let from = scratch.sums.as_ptr().add((channel - channels.start) * width + piece.from);
-                    let to = result.0.add(channel * channel_size + piece.to);
+                    let from = tile.out.add(channel * tile.out_stride + piece.from);
+                    let to = result.add(channel * channel_size + piece.to);
                     if self.step == 1 {
-                        for i in 0..piece.count {
-                            *to.add(i) = *from.add(i) + bias;
-                        }
+                        to.copy_from_nonoverlapping(from, piece.count);
                     } else {
                         for i in 0..piece.count {
-                            *to.add(i * self.step) = *from.add(i) + bias;
+                            *to.add(i * self.step) = *from.add(i);
                         }
                     }
                 }
             }
         }
+    }
+}
+
+impl Piece {
+    /// Whether `next` goes on where this piece ends, in the tile and in the result.
+    fn is_continued_by(&self, next: &Self, step: usize) -> bool {
+        next.from == self.from + self.count && next.to == self.to + self.count * step
     }
 }

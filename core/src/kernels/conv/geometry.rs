@@ -126,6 +126,12 @@ pub(super) struct PaddedSource {
 }
 
 impl PaddedSource {
+    /// Whether the image can be read where it is: a 1 × 1 kernel moves nothing, and rows of whole vectors let no vector
+    /// reach beyond the image.
+    pub fn is_in_place(&self) -> bool {
+        self.kernel == [1, 1] && self.stride == 1 && self.lead == [0, 0] && self.grid == self.size && self.grid[1] % 16 == 0
+    }
+
     /// Distance of two rows of a plane.
     pub fn pitch(&self) -> usize {
         self.grid[1] + self.halo(1)
@@ -203,6 +209,12 @@ impl PaddedSource {
             let from = &from[(stride * begin as isize + first) as usize..];
             if stride == 1 {
                 to[begin..end].copy_from_slice(&from[..end - begin]);
+            } else if stride == 2 {
+                // Spelt out so that compilers make shuffles of it; the last value may have no neighbour.
+                for (to, from) in to[begin..end].iter_mut().zip(from.chunks_exact(2)) {
+                    *to = from[0];
+                }
+                to[end - 1] = from[2 * (end - 1 - begin)];
             } else {
                 for (to, from) in to[begin..end].iter_mut().zip(from.iter().step_by(self.stride)) {
                     *to = *from;
@@ -222,6 +234,9 @@ impl PaddedSource {
     }
 
     fn plane_size(&self) -> usize {
+        if self.is_in_place() {
+            return self.size[0] * self.size[1];
+        }
         (self.strip + self.halo(0)) * self.pitch()
     }
 }

@@ -8,6 +8,9 @@ pub(super) const MOST_ROWS: usize = 8;
 /// Most vectors that one product holds in registers, beside each other.
 pub(super) const MOST_VECTORS: usize = 3;
 
+/// Side of the squares that [`transpose`] moves at a time.
+const SQUARE: usize = 8;
+
 /// A register of f32 lanes.
 ///
 /// The methods are `inline(always)`, so a generic kernel called from a function with a `target_feature` becomes code
@@ -41,6 +44,20 @@ pub(super) trait Vector: Copy {
     /// # Safety
     /// The processor has this type's instruction set.
     unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self;
+
+    /// Transposes 8 × 8 values: `to[i·to_stride + j] = from[j·from_stride + i]`.
+    ///
+    /// # Safety
+    /// The processor has this type's instruction set; both squares are inside their buffers and apart.
+    #[inline(always)]
+    unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
+        for i in 0..SQUARE {
+            for j in 0..SQUARE {
+                // SAFETY: the caller vouches for both squares.
+                unsafe { *to.add(i * to_stride + j) = *from.add(j * from_stride + i) };
+            }
+        }
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -74,6 +91,12 @@ mod x86 {
             // SAFETY: the caller vouches for AVX-512F.
             unsafe { _mm512_fmadd_ps(self, factor, addend) }
         }
+
+        #[inline(always)]
+        unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
+            // SAFETY: the caller vouches for both squares and for AVX, which every processor with AVX-512F has.
+            unsafe { transpose_square(from, from_stride, to, to_stride) }
+        }
     }
 
     impl super::Vector for __m256 {
@@ -102,6 +125,40 @@ mod x86 {
         unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
             // SAFETY: the caller vouches for FMA.
             unsafe { _mm256_fmadd_ps(self, factor, addend) }
+        }
+
+        #[inline(always)]
+        unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
+            // SAFETY: the caller vouches for both squares and for AVX, which every processor with AVX2 has.
+            unsafe { transpose_square(from, from_stride, to, to_stride) }
+        }
+    }
+
+    /// Pairs, then quadruples, then halves of the rows change places.
+    #[inline(always)]
+    unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
+        // SAFETY: the caller vouches for AVX and for both squares.
+        unsafe {
+            let (r0, r1, r2, r3) =
+                (_mm256_loadu_ps(from.add(0 * from_stride)), _mm256_loadu_ps(from.add(1 * from_stride)), _mm256_loadu_ps(from.add(2 * from_stride)), _mm256_loadu_ps(from.add(3 * from_stride)));
+            let (r4, r5, r6, r7) =
+                (_mm256_loadu_ps(from.add(4 * from_stride)), _mm256_loadu_ps(from.add(5 * from_stride)), _mm256_loadu_ps(from.add(6 * from_stride)), _mm256_loadu_ps(from.add(7 * from_stride)));
+            let (a0, a1) = (_mm256_unpacklo_ps(r0, r1), _mm256_unpackhi_ps(r0, r1));
+            let (a2, a3) = (_mm256_unpacklo_ps(r2, r3), _mm256_unpackhi_ps(r2, r3));
+            let (a4, a5) = (_mm256_unpacklo_ps(r4, r5), _mm256_unpackhi_ps(r4, r5));
+            let (a6, a7) = (_mm256_unpacklo_ps(r6, r7), _mm256_unpackhi_ps(r6, r7));
+            let (b0, b1) = (_mm256_shuffle_ps::<0x44>(a0, a2), _mm256_shuffle_ps::<0xee>(a0, a2));
+            let (b2, b3) = (_mm256_shuffle_ps::<0x44>(a1, a3), _mm256_shuffle_ps::<0xee>(a1, a3));
+            let (b4, b5) = (_mm256_shuffle_ps::<0x44>(a4, a6), _mm256_shuffle_ps::<0xee>(a4, a6));
+            let (b6, b7) = (_mm256_shuffle_ps::<0x44>(a5, a7), _mm256_shuffle_ps::<0xee>(a5, a7));
+            _mm256_storeu_ps(to, _mm256_permute2f128_ps::<0x20>(b0, b4));
+            _mm256_storeu_ps(to.add(to_stride), _mm256_permute2f128_ps::<0x20>(b1, b5));
+            _mm256_storeu_ps(to.add(2 * to_stride), _mm256_permute2f128_ps::<0x20>(b2, b6));
+            _mm256_storeu_ps(to.add(3 * to_stride), _mm256_permute2f128_ps::<0x20>(b3, b7));
+            _mm256_storeu_ps(to.add(4 * to_stride), _mm256_permute2f128_ps::<0x31>(b0, b4));
+            _mm256_storeu_ps(to.add(5 * to_stride), _mm256_permute2f128_ps::<0x31>(b1, b5));
+            _mm256_storeu_ps(to.add(6 * to_stride), _mm256_permute2f128_ps::<0x31>(b2, b6));
+            _mm256_storeu_ps(to.add(7 * to_stride), _mm256_permute2f128_ps::<0x31>(b3, b7));
         }
     }
 }
@@ -139,6 +196,35 @@ impl Vector for FourLanes {
             *sum = if cfg!(target_arch = "aarch64") { a.mul_add(b, *sum) } else { a * b + *sum };
         }
         Self(sum)
+    }
+}
+
+/// Transposes a matrix: `to[i·to_stride + j] = from[j·from_stride + i]` for j < `rows`, i < `columns`.
+///
+/// # Safety
+/// The processor has `V`'s instruction set; both matrices are inside their buffers and apart.
+#[inline(always)]
+pub(super) unsafe fn transpose<V: Vector>(
+    (rows, columns): (usize, usize),
+    (from, from_stride): (*const f32, usize),
+    (to, to_stride): (*mut f32, usize),
+) {
+    // SAFETY: the caller vouches for the whole matrices, and every index below is inside them.
+    unsafe {
+        for j in (0..rows).step_by(SQUARE) {
+            for i in (0..columns).step_by(SQUARE) {
+                let (from, to) = (from.add(j * from_stride + i), to.add(i * to_stride + j));
+                if j + SQUARE <= rows && i + SQUARE <= columns {
+                    V::transpose_square(from, from_stride, to, to_stride);
+                    continue;
+                }
+                for i in 0..SQUARE.min(columns - i) {
+                    for j in 0..SQUARE.min(rows - j) {
+                        *to.add(i * to_stride + j) = *from.add(j * from_stride + i);
+                    }
+                }
+            }
+        }
     }
 }
 
@@ -185,7 +271,7 @@ fn with_avx2<J: Job>(job: J) {
     unsafe { job.run::<std::arch::x86_64::__m256>() }
 }
 
-/// One small product: `out[m][n] (+)= Σ_r Σ_k rows[m][r·row_step + k] · columns[r·column_step + offsets[k] + n]`.
+/// One small product: `out[m][n] = initial[m] + Σ_r Σ_k rows[m][r·row_step + k] · columns[r·column_step + offsets[k] + n]`.
 pub(super) struct Product<'a> {
     /// Where each row starts.
     pub rows: [*const f32; MOST_ROWS],
@@ -203,8 +289,10 @@ pub(super) struct Product<'a> {
     pub out: *mut f32,
     /// Distance of two rows of `out`.
     pub out_stride: usize,
-    /// Whether `out` holds earlier summands to add to; else it is overwritten.
-    pub accumulate: bool,
+    /// Rows to be stored; the others only fill up the registers.
+    pub stored: usize,
+    /// What the sums of each row start from; none where `out` holds earlier summands to add to.
+    pub initial: Option<[f32; MOST_ROWS]>,
 }
 
 /// The height of the product that treats `left` remaining rows: a full one while there are enough.
@@ -247,10 +335,14 @@ unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Pro
     // SAFETY: the caller of `multiply` vouches for every address below.
     unsafe {
         let mut sums = [[V::splat(0.0); VECTORS]; ROWS];
-        if product.accumulate {
-            for (m, row) in sums.iter_mut().enumerate() {
-                for (n, sum) in row.iter_mut().enumerate() {
-                    *sum = V::load(product.out.add(m * product.out_stride + n * V::LANES));
+        for (m, row) in sums.iter_mut().enumerate() {
+            for (n, sum) in row.iter_mut().enumerate() {
+                match product.initial {
+                    Some(initial) => *sum = V::splat(initial[m]),
+                    None if m < product.stored => {
+                        *sum = V::load(product.out.add(m * product.out_stride + n * V::LANES));
+                    }
+                    None => {}
                 }
             }
         }
@@ -275,6 +367,9 @@ unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Pro
             }
         }
         for (m, row) in sums.iter().enumerate() {
+            if m >= product.stored {
+                break;
+            }
             for (n, sum) in row.iter().enumerate() {
                 sum.store(product.out.add(m * product.out_stride + n * V::LANES));
             }

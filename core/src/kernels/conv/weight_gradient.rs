@@ -18,6 +18,9 @@ use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Vector};
 /// most of a first-level cache.
 const STRIP_POSITIONS: usize = 192;
 
+/// Sums of one task: they stay in the second-level cache beside the strip.
+const SUMS: usize = 32_000;
+
 /// `[O, C, kh, kw]`, row-major, from the input `[B, C, H, W]` and the gradient of the output `[B, O, Ho, Wo]`.
 pub(super) fn weight_gradient(
     instruction_set: InstructionSet,
@@ -28,14 +31,15 @@ pub(super) fn weight_gradient(
     let mut source = PaddedSource::of_input(geometry);
     source.strip = (STRIP_POSITIONS / geometry.output_width).clamp(1, geometry.output_height);
 
-    // Output channels in chunks of one to three vectors, as equal as can be; then input channels, as needed to give
-    // every thread a share.
+    // Output channels in chunks of one to three vectors, as equal as can be; then input channels, as needed to keep
+    // the sums near and to give every thread a share.
     let lanes = instruction_set.lanes();
     let vectors = geometry.output_channels.div_ceil(lanes);
     let chunks = vectors.div_ceil(MOST_VECTORS);
     let threads = rayon::current_num_threads();
     let groups = threads.div_ceil(chunks).min(geometry.input_channels);
-    let group = geometry.input_channels.div_ceil(groups);
+    let most = (SUMS / (geometry.taps() * MOST_VECTORS * lanes)).max(1);
+    let group = geometry.input_channels.div_ceil(groups).min(most);
     let groups = geometry.input_channels.div_ceil(group);
 
     let size = geometry.weight_shape().iter().product();
@@ -135,10 +139,12 @@ impl tile::Job for WeightJob<'_> {
 
         let Scratch { strip, gradients, sums } = self.scratch;
         let strip_positions = source.strip * geometry.output_width;
+        // Zeros where the last vector has no channel: what is left there from another task might not be finite.
         gradients.clear();
         gradients.resize(strip_positions * width, 0.0);
-        sums.clear();
-        sums.resize((weights + MOST_ROWS) * width, 0.0);
+        if sums.len() < weights * width {
+            sums.resize(weights * width, 0.0);
+        }
 
         for image in 0..geometry.batch {
             let input = &self.input[image * geometry.input_size()..][..geometry.input_size()];
@@ -146,7 +152,18 @@ impl tile::Job for WeightJob<'_> {
             for index in 0..source.strips() {
                 let rows = source.rows_of_strip(index);
                 source.fill(input, self.input_channels.clone(), rows.clone(), 0, strip);
-                interleave(geometry, grad_output, &self.output_channels, &rows, width, gradients);
+                let plane = geometry.output_height * geometry.output_width;
+                let first = self.output_channels.start * plane + rows.start * geometry.output_width;
+                // Gradients as [position, channel].
+                // SAFETY: these channels' rows are inside the image (`first` starts the first of them, checked by the
+                // slice), and `gradients` has room for `width` channels at each position of a strip.
+                unsafe {
+                    tile::transpose::<V>(
+                        (self.output_channels.len(), rows.len() * geometry.output_width),
+                        (grad_output[first..].as_ptr(), plane),
+                        (gradients.as_mut_ptr(), width),
+                    );
+                }
                 let mut weight = 0;
                 while weight < weights {
                     let height = tile::rows_of_next::<V>(weights - weight);
@@ -167,7 +184,8 @@ impl tile::Job for WeightJob<'_> {
                             repetitions: rows.len(),
                             out: sums.as_mut_ptr().add(weight * width),
                             out_stride: width,
-                            accumulate: true,
+                            stored: height.min(weights - weight),
+                            initial: (image == 0 && index == 0).then_some([0.0; MOST_ROWS]),
                         };
                         tile::multiply::<V>(height, vectors, &product);
                     }
@@ -176,37 +194,16 @@ impl tile::Job for WeightJob<'_> {
             }
         }
 
-        let first = self.input_channels.start * taps.len();
-        for (column, channel) in self.output_channels.enumerate() {
-            let to = channel * geometry.input_channels * taps.len() + first;
-            for weight in 0..weights {
-                // SAFETY: inside [O, C·taps]; no other task has these input and output channels.
-                unsafe { *self.result.0.add(to + weight) = sums[weight * width + column] };
-            }
-        }
-    }
-}
-
-/// Lays the gradients of some channels and rows out as `[position, channel]`, `width` values per position.
-fn interleave(
-    geometry: &Geometry,
-    grad_output: &[f32],
-    channels: &Range<usize>,
-    rows: &Range<usize>,
-    width: usize,
-    to: &mut [f32],
-) {
-    let plane = geometry.output_height * geometry.output_width;
-    let positions = rows.len() * geometry.output_width;
-    let first = rows.start * geometry.output_width;
-    // Short runs of positions, so that what is being written stays in the first-level cache.
-    for run in (0..positions).step_by(16) {
-        let count = (positions - run).min(16);
-        for (column, channel) in channels.clone().enumerate() {
-            let from = &grad_output[channel * plane + first + run..][..count];
-            for (position, value) in to[run * width..].chunks_exact_mut(width).zip(from) {
-                position[column] = *value;
-            }
+        let row = geometry.input_channels * taps.len();
+        let first = self.output_channels.start * row + self.input_channels.start * taps.len();
+        // SAFETY: the sums are [weights, width]; the result is [O, C·taps], and no other task has these input and output
+        // channels.
+        unsafe {
+            tile::transpose::<V>(
+                (weights, self.output_channels.len()),
+                (sums.as_ptr(), width),
+                (self.result.0.add(first), row),
+            );
         }
     }
 }
