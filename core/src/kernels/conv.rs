@@ -14,8 +14,9 @@
 //! differentiated. What a backward pass returns is not tracked for another one: candle detaches gradients anyway.
 //!
 //! On a CPU in f32 the maps are computed directly, by vectors of whatever instruction set the processor has; other
-//! devices and types go through candle's own operations.
+//! devices and types go through candle's own operations. [`bias_leaky_relu`], which follows most convolutions, is here too.
 
+mod activation;
 mod composed;
 mod direct;
 mod geometry;
@@ -26,12 +27,12 @@ mod weight_gradient;
 #[cfg(test)]
 mod tests;
 
-use std::sync::OnceLock;
-
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, DType, Layout, Shape, Tensor};
 
+use self::activation::ChannelSums;
+pub use self::activation::{bias_leaky_relu, leaky_relu_gradient};
 use self::geometry::Geometry;
-use crate::{Error, Result};
+use crate::{Error, Result, kernels};
 
 /// The convolution (in the networks' sense, i.e. the correlation) of `input` `[B, C, H, W]` by `weight`
 /// `[O, C, kh, kw]`, plus `bias` `[O]`: `[B, O, Ho, Wo]` with `Ho = ⌊(H + 2·padding − kh) / stride⌋ + 1`.
@@ -198,33 +199,15 @@ impl InstructionSet {
 }
 
 impl Path {
-    /// What the environment variable `CNERF_KERNEL` asks for (`plain`, `portable`, `avx2`, `avx512`), or the fastest that
-    /// this processor has. Read once.
+    /// The counterpart of the fields' [`kernels::selected`], so that one variable chooses for both.
     fn chosen() -> Result<Self> {
-        static CHOSEN: OnceLock<std::result::Result<Path, String>> = OnceLock::new();
-        CHOSEN
-            .get_or_init(|| Self::named(std::env::var("CNERF_KERNEL").ok().as_deref()))
-            .clone()
-            .map_err(|reason| Error::config("CNERF_KERNEL", reason))
-    }
-
-    fn named(name: Option<&str>) -> std::result::Result<Self, String> {
-        let instruction_set = match name {
-            None | Some("") => [InstructionSet::Avx512, InstructionSet::Avx2]
-                .into_iter()
-                .find(|set| set.available())
-                .unwrap_or(InstructionSet::Portable),
-            Some("plain") => return Ok(Self::Plain),
-            Some("portable") => InstructionSet::Portable,
-            Some("avx2") => InstructionSet::Avx2,
-            Some("avx512") => InstructionSet::Avx512,
-            Some(other) => return Err(format!("no kernel is called {other:?}; use plain, portable, avx2 or avx512")),
+        let instruction_set = match kernels::selected()?.name() {
+            "plain" => return Ok(Self::Plain),
+            "avx512" => InstructionSet::Avx512,
+            "avx2" => InstructionSet::Avx2,
+            _ => InstructionSet::Portable,
         };
-        if instruction_set.available() {
-            Ok(Self::Direct(instruction_set))
-        } else {
-            Err(format!("this processor has no {instruction_set:?}; leave the variable unset to use what it has"))
-        }
+        Ok(Self::Direct(if instruction_set.available() { instruction_set } else { InstructionSet::Portable }))
     }
 
     fn forward(self, geometry: &Geometry, input: &[f32], weight: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
@@ -277,11 +260,6 @@ struct InputGradient {
 struct WeightGradient {
     geometry: Geometry,
     path: Path,
-}
-
-/// The gradient of a convolution's bias; not differentiable, it is a mere sum.
-struct BiasGradient {
-    geometry: Geometry,
 }
 
 /// The three maps on tensors, for backward passes: nothing is computed for an argument that depends on no variable.
@@ -369,11 +347,10 @@ impl CustomOp3 for Convolution {
         grad_output: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let backward = Backward { geometry: self.geometry, path: self.path };
-        let operation = BiasGradient { geometry: self.geometry };
         Ok((
             backward.input(input, grad_output, weight)?,
             backward.weight(weight, input, grad_output)?,
-            wanted(bias, || grad_output.contiguous()?.apply_op1_no_bwd(&operation))?,
+            wanted(bias, || grad_output.contiguous()?.apply_op1_no_bwd(&ChannelSums))?,
         ))
     }
 }
@@ -433,17 +410,6 @@ impl CustomOp2 for WeightGradient {
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
         let backward = Backward { geometry: self.geometry, path: self.path };
         Ok((backward.input(input, grad_output, cotangent)?, backward.output(grad_output, input, cotangent)?))
-    }
-}
-
-impl candle_core::CustomOp1 for BiasGradient {
-    fn name(&self) -> &'static str {
-        "bias gradient of conv2d"
-    }
-
-    fn cpu_fwd(&self, grad_output: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
-        let bias = weight_gradient::bias_gradient(&self.geometry, values(grad_output, layout)?);
-        Ok((CpuStorage::F32(bias), Shape::from(self.geometry.output_channels)))
     }
 }
 

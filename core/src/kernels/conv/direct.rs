@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use super::InstructionSet;
 use super::geometry::{Geometry, PaddedSource};
-use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Vector};
+use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Registers};
 
 /// Values of one strip: about half of a second-level cache of 1 MB, the rest is for weights and sums.
 const STRIP_VALUES: usize = 128_000;
@@ -271,10 +271,10 @@ struct StripJob<'a> {
 
 impl tile::Job for StripJob<'_> {
     #[inline(always)]
-    unsafe fn run<V: Vector>(self) {
+    unsafe fn run<V: Registers>(self) {
         let Self { plan, image, bias, rows, channels, result, scratch: Scratch { strip, sums, pieces } } = self;
         let source = &plan.source;
-        let width = MOST_VECTORS * V::LANES;
+        let width = MOST_VECTORS * V::COUNT;
         let strip = if source.is_in_place() {
             image[rows.start * source.pitch()..].as_ptr()
         } else {
@@ -293,10 +293,10 @@ impl tile::Job for StripJob<'_> {
         // a whole number of vectors does each start its own tile, because then nothing is wasted.
         let (pitch, columns) = (source.pitch(), source.grid[1]);
         let all = (rows.len() - 1) * pitch + columns;
-        let by_row = pitch > columns && rows.len() * columns.div_ceil(V::LANES) <= all.div_ceil(V::LANES);
+        let by_row = pitch > columns && rows.len() * columns.div_ceil(V::COUNT) <= all.div_ceil(V::COUNT);
         let (segments, length) = if by_row { (rows.len(), columns) } else { (1, all) };
         // Tiles as equal as can be: four vectors are two and two, because a single one leaves the processor waiting.
-        let vectors = length.div_ceil(V::LANES);
+        let vectors = length.div_ceil(V::COUNT);
         let per_segment = vectors.div_ceil(MOST_VECTORS);
 
         for phase in &plan.phases {
@@ -304,18 +304,23 @@ impl tile::Job for StripJob<'_> {
             while tile < segments * per_segment {
                 let count = TILES.min(segments * per_segment - tile);
                 let mut tiles =
-                    [const { Tile { start: 0, vectors: 0, out: std::ptr::null_mut(), out_stride: 0, pieces: 0..0 } }; TILES];
+                    [const { Tile { start: 0, vectors: 0, out: std::ptr::null_mut(), out_stride: 0, pieces: 0..0 } };
+                        TILES];
                 pieces.clear();
                 for (index, to) in tiles[..count].iter_mut().enumerate() {
                     let (segment, part) = ((tile + index) / per_segment, (tile + index) % per_segment);
                     let first = segment * pitch;
-                    let end = length.min((part + 1) * vectors / per_segment * V::LANES);
-                    let positions = first + part * vectors / per_segment * V::LANES..first + end;
+                    let end = length.min((part + 1) * vectors / per_segment * V::COUNT);
+                    let positions = first + part * vectors / per_segment * V::COUNT..first + end;
                     to.start = positions.start;
-                    to.vectors = positions.len().div_ceil(V::LANES);
+                    to.vectors = positions.len().div_ceil(V::COUNT);
                     let first = pieces.len();
                     plan.add_pieces(phase, rows.start, positions, pieces);
-                    let whole = Piece { from: 0, count: to.vectors * V::LANES, ..pieces.get(first).copied().unwrap_or_default() };
+                    let whole = Piece {
+                        from: 0,
+                        count: to.vectors * V::COUNT,
+                        ..pieces.get(first).copied().unwrap_or_default()
+                    };
                     if plan.step == 1 && pieces[first..] == [whole] {
                         // SAFETY: a piece is inside the result's channel.
                         to.out = unsafe { result.add(whole.to) };
@@ -349,7 +354,7 @@ impl Plan<'_> {
     /// The processor has `V`'s instruction set, the strip can be read at all tiles, and each tile's `out` can be written
     /// for all channels.
     #[inline(always)]
-    unsafe fn sum<V: Vector>(
+    unsafe fn sum<V: Registers>(
         &self,
         phase: &Phase<'_>,
         strip: *const f32,
@@ -359,7 +364,7 @@ impl Plan<'_> {
     ) {
         let summands = phase.offsets.len();
         let taps = (summands / self.source.channels).max(1);
-        let tile_values = MOST_VECTORS * V::LANES * self.source.kernel[0];
+        let tile_values = MOST_VECTORS * V::COUNT * self.source.kernel[0];
         let block = (BLOCK_VALUES / tile_values).max(1) * taps;
         let mut first = 0;
         loop {

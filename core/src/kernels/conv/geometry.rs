@@ -129,7 +129,11 @@ impl PaddedSource {
     /// Whether the image can be read where it is: a 1 × 1 kernel moves nothing, and rows of whole vectors let no vector
     /// reach beyond the image.
     pub fn is_in_place(&self) -> bool {
-        self.kernel == [1, 1] && self.stride == 1 && self.lead == [0, 0] && self.grid == self.size && self.grid[1] % 16 == 0
+        self.kernel == [1, 1]
+            && self.stride == 1
+            && self.lead == [0, 0]
+            && self.grid == self.size
+            && self.grid[1] % 16 == 0
     }
 
     /// Distance of two rows of a plane.

@@ -1,7 +1,8 @@
 //! The inner product under every convolution: a few rows of one operand, a few vectors of the other, all sums in
-//! registers. Written once over [`Vector`] and compiled for each instruction set that [`on`] can choose.
+//! registers. Written once over [`Lanes`] and compiled for each instruction set that [`on`] can choose.
 
 use super::InstructionSet;
+use crate::kernels::simd::{Lanes, Portable};
 
 /// Most rows that one product holds in registers.
 pub(super) const MOST_ROWS: usize = 8;
@@ -11,44 +12,18 @@ pub(super) const MOST_VECTORS: usize = 3;
 /// Side of the squares that [`transpose`] moves at a time.
 const SQUARE: usize = 8;
 
-/// A register of f32 lanes.
+/// What the products need of a register type beyond its lanes.
 ///
-/// The methods are `inline(always)`, so a generic kernel called from a function with a `target_feature` becomes code
-/// for that instruction set.
-pub(super) trait Vector: Copy {
-    /// Values in one register.
-    const LANES: usize;
+/// # Safety
+/// As [`Lanes`].
+pub(super) trait Registers: Lanes {
     /// Rows of a full product: as many as leave the register file room for the operands.
     const ROWS: usize;
-
-    /// All lanes `value`.
-    ///
-    /// # Safety
-    /// The processor has this type's instruction set.
-    unsafe fn splat(value: f32) -> Self;
-
-    /// The `LANES` values at `from`, at any alignment.
-    ///
-    /// # Safety
-    /// The processor has this type's instruction set and `from` is readable for `LANES` values.
-    unsafe fn load(from: *const f32) -> Self;
-
-    /// Writes the lanes to `to`, at any alignment.
-    ///
-    /// # Safety
-    /// The processor has this type's instruction set and `to` is writable for `LANES` values.
-    unsafe fn store(self, to: *mut f32);
-
-    /// `self · factor + addend`.
-    ///
-    /// # Safety
-    /// The processor has this type's instruction set.
-    unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self;
 
     /// Transposes 8 × 8 values: `to[i·to_stride + j] = from[j·from_stride + i]`.
     ///
     /// # Safety
-    /// The processor has this type's instruction set; both squares are inside their buffers and apart.
+    /// The processor has this type's instructions; both squares are inside their buffers and apart.
     #[inline(always)]
     unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
         for i in 0..SQUARE {
@@ -60,76 +35,30 @@ pub(super) trait Vector: Copy {
     }
 }
 
+impl Registers for Portable {
+    const ROWS: usize = 4;
+}
+
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::x86_64::*;
 
-    impl super::Vector for __m512 {
-        const LANES: usize = 16;
+    impl super::Registers for __m512 {
         const ROWS: usize = 8;
 
         #[inline(always)]
-        unsafe fn splat(value: f32) -> Self {
-            // SAFETY: the caller vouches for AVX-512F.
-            unsafe { _mm512_set1_ps(value) }
-        }
-
-        #[inline(always)]
-        unsafe fn load(from: *const f32) -> Self {
-            // SAFETY: the caller vouches for AVX-512F and for 16 readable values.
-            unsafe { _mm512_loadu_ps(from) }
-        }
-
-        #[inline(always)]
-        unsafe fn store(self, to: *mut f32) {
-            // SAFETY: the caller vouches for AVX-512F and for 16 writable values.
-            unsafe { _mm512_storeu_ps(to, self) }
-        }
-
-        #[inline(always)]
-        unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
-            // SAFETY: the caller vouches for AVX-512F.
-            unsafe { _mm512_fmadd_ps(self, factor, addend) }
-        }
-
-        #[inline(always)]
         unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
-            // SAFETY: the caller vouches for both squares and for AVX, which every processor with AVX-512F has.
+            // SAFETY: the caller vouches for both squares and for AVX-512F, which no processor has without AVX.
             unsafe { transpose_square(from, from_stride, to, to_stride) }
         }
     }
 
-    impl super::Vector for __m256 {
-        const LANES: usize = 8;
+    impl super::Registers for __m256 {
         const ROWS: usize = 4;
 
         #[inline(always)]
-        unsafe fn splat(value: f32) -> Self {
-            // SAFETY: the caller vouches for AVX.
-            unsafe { _mm256_set1_ps(value) }
-        }
-
-        #[inline(always)]
-        unsafe fn load(from: *const f32) -> Self {
-            // SAFETY: the caller vouches for AVX and for 8 readable values.
-            unsafe { _mm256_loadu_ps(from) }
-        }
-
-        #[inline(always)]
-        unsafe fn store(self, to: *mut f32) {
-            // SAFETY: the caller vouches for AVX and for 8 writable values.
-            unsafe { _mm256_storeu_ps(to, self) }
-        }
-
-        #[inline(always)]
-        unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
-            // SAFETY: the caller vouches for FMA.
-            unsafe { _mm256_fmadd_ps(self, factor, addend) }
-        }
-
-        #[inline(always)]
         unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
-            // SAFETY: the caller vouches for both squares and for AVX, which every processor with AVX2 has.
+            // SAFETY: the caller vouches for both squares and for AVX.
             unsafe { transpose_square(from, from_stride, to, to_stride) }
         }
     }
@@ -139,10 +68,18 @@ mod x86 {
     unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
         // SAFETY: the caller vouches for AVX and for both squares.
         unsafe {
-            let (r0, r1, r2, r3) =
-                (_mm256_loadu_ps(from.add(0 * from_stride)), _mm256_loadu_ps(from.add(1 * from_stride)), _mm256_loadu_ps(from.add(2 * from_stride)), _mm256_loadu_ps(from.add(3 * from_stride)));
-            let (r4, r5, r6, r7) =
-                (_mm256_loadu_ps(from.add(4 * from_stride)), _mm256_loadu_ps(from.add(5 * from_stride)), _mm256_loadu_ps(from.add(6 * from_stride)), _mm256_loadu_ps(from.add(7 * from_stride)));
+            let (r0, r1, r2, r3) = (
+                _mm256_loadu_ps(from.add(0 * from_stride)),
+                _mm256_loadu_ps(from.add(1 * from_stride)),
+                _mm256_loadu_ps(from.add(2 * from_stride)),
+                _mm256_loadu_ps(from.add(3 * from_stride)),
+            );
+            let (r4, r5, r6, r7) = (
+                _mm256_loadu_ps(from.add(4 * from_stride)),
+                _mm256_loadu_ps(from.add(5 * from_stride)),
+                _mm256_loadu_ps(from.add(6 * from_stride)),
+                _mm256_loadu_ps(from.add(7 * from_stride)),
+            );
             let (a0, a1) = (_mm256_unpacklo_ps(r0, r1), _mm256_unpackhi_ps(r0, r1));
             let (a2, a3) = (_mm256_unpacklo_ps(r2, r3), _mm256_unpackhi_ps(r2, r3));
             let (a4, a5) = (_mm256_unpacklo_ps(r4, r5), _mm256_unpackhi_ps(r4, r5));
@@ -163,48 +100,12 @@ mod x86 {
     }
 }
 
-/// Four lanes in plain Rust, which compilers turn into NEON, SSE2 or WebAssembly vectors.
-#[derive(Clone, Copy)]
-pub(super) struct FourLanes([f32; 4]);
-
-impl Vector for FourLanes {
-    const LANES: usize = 4;
-    const ROWS: usize = 4;
-
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        Self([value; 4])
-    }
-
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the caller vouches for 4 readable values; an array of f32 has f32's alignment.
-        Self(unsafe { from.cast::<[f32; 4]>().read() })
-    }
-
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the caller vouches for 4 writable values; an array of f32 has f32's alignment.
-        unsafe { to.cast::<[f32; 4]>().write(self.0) }
-    }
-
-    #[inline(always)]
-    unsafe fn multiply_add(self, factor: Self, addend: Self) -> Self {
-        let mut sum = addend.0;
-        for ((sum, a), b) in sum.iter_mut().zip(self.0).zip(factor.0) {
-            // Where the processor has no fused form, `mul_add` would be a call into the C library.
-            *sum = if cfg!(target_arch = "aarch64") { a.mul_add(b, *sum) } else { a * b + *sum };
-        }
-        Self(sum)
-    }
-}
-
 /// Transposes a matrix: `to[i·to_stride + j] = from[j·from_stride + i]` for j < `rows`, i < `columns`.
 ///
 /// # Safety
 /// The processor has `V`'s instruction set; both matrices are inside their buffers and apart.
 #[inline(always)]
-pub(super) unsafe fn transpose<V: Vector>(
+pub(super) unsafe fn transpose<V: Registers>(
     (rows, columns): (usize, usize),
     (from, from_stride): (*const f32, usize),
     (to, to_stride): (*mut f32, usize),
@@ -235,11 +136,11 @@ pub(super) trait Job {
     ///
     /// # Safety
     /// The processor has `V`'s instruction set.
-    unsafe fn run<V: Vector>(self);
+    unsafe fn run<V: Registers>(self);
 }
 
 /// Runs `job` with the registers of `instruction_set`, which must be one this processor has
-/// ([`InstructionSet::available`]); anything else falls back to [`FourLanes`].
+/// ([`InstructionSet::available`]); anything else falls back to [`Portable`].
 pub(super) fn on<J: Job>(instruction_set: InstructionSet, job: J) {
     match instruction_set {
         #[cfg(target_arch = "x86_64")]
@@ -253,7 +154,7 @@ pub(super) fn on<J: Job>(instruction_set: InstructionSet, job: J) {
             unsafe { with_avx2(job) }
         }
         // SAFETY: plain Rust, no instruction set needed.
-        _ => unsafe { job.run::<FourLanes>() },
+        _ => unsafe { job.run::<Portable>() },
     }
 }
 
@@ -298,7 +199,7 @@ pub(super) struct Product<'a> {
 /// The height of the product that treats `left` remaining rows: a full one while there are enough.
 /// Surplus rows of a product must point at readable values; their sums are computed and ignored.
 #[inline(always)]
-pub(super) fn rows_of_next<V: Vector>(left: usize) -> usize {
+pub(super) fn rows_of_next<V: Registers>(left: usize) -> usize {
     match left {
         1 => 1,
         2..=4 => 4,
@@ -310,9 +211,9 @@ pub(super) fn rows_of_next<V: Vector>(left: usize) -> usize {
 ///
 /// # Safety
 /// The processor has `V`'s instruction set; every address that the formula of [`Product`] names is readable, and
-/// `out` is writable, for `rows` rows and `vectors · LANES` columns.
+/// `out` is writable, for `rows` rows and `vectors · COUNT` columns.
 #[inline(always)]
-pub(super) unsafe fn multiply<V: Vector>(rows: usize, vectors: usize, product: &Product<'_>) {
+pub(super) unsafe fn multiply<V: Registers>(rows: usize, vectors: usize, product: &Product<'_>) {
     // SAFETY: the caller's promise covers every shape up to (rows, vectors), and each arm computes exactly that one.
     unsafe {
         match (rows, vectors) {
@@ -331,7 +232,7 @@ pub(super) unsafe fn multiply<V: Vector>(rows: usize, vectors: usize, product: &
 
 /// [`multiply`] at a fixed shape, all sums in registers.
 #[inline(always)]
-unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Product<'_>) {
+unsafe fn tile<V: Registers, const ROWS: usize, const VECTORS: usize>(product: &Product<'_>) {
     // SAFETY: the caller of `multiply` vouches for every address below.
     unsafe {
         let mut sums = [[V::splat(0.0); VECTORS]; ROWS];
@@ -340,7 +241,7 @@ unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Pro
                 match product.initial {
                     Some(initial) => *sum = V::splat(initial[m]),
                     None if m < product.stored => {
-                        *sum = V::load(product.out.add(m * product.out_stride + n * V::LANES));
+                        *sum = V::load(product.out.add(m * product.out_stride + n * V::COUNT));
                     }
                     None => {}
                 }
@@ -356,12 +257,12 @@ unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Pro
                 let from = columns.add(offset as usize);
                 let mut factors = [V::splat(0.0); VECTORS];
                 for (n, factor) in factors.iter_mut().enumerate() {
-                    *factor = V::load(from.add(n * V::LANES));
+                    *factor = V::load(from.add(n * V::COUNT));
                 }
                 for (row, sums) in rows.iter().zip(sums.iter_mut()) {
                     let weight = V::splat(*row.add(k));
                     for (sum, factor) in sums.iter_mut().zip(factors) {
-                        *sum = weight.multiply_add(factor, *sum);
+                        *sum = weight.mul_add(factor, *sum);
                     }
                 }
             }
@@ -371,7 +272,7 @@ unsafe fn tile<V: Vector, const ROWS: usize, const VECTORS: usize>(product: &Pro
                 break;
             }
             for (n, sum) in row.iter().enumerate() {
-                sum.store(product.out.add(m * product.out_stride + n * V::LANES));
+                sum.store(product.out.add(m * product.out_stride + n * V::COUNT));
             }
         }
     }

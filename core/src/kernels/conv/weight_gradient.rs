@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::InstructionSet;
 use super::direct::SharedOutput;
 use super::geometry::{Geometry, PaddedSource};
-use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Vector};
+use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Registers};
 
 /// Positions summed between two visits to the sums in memory: their gradients, for three vectors of channels, fill
 /// most of a first-level cache.
@@ -69,32 +69,6 @@ pub(super) fn weight_gradient(
     result
 }
 
-/// The gradients of the bias, `[O]`: sums of the output's gradient over images and positions.
-pub(super) fn bias_gradient(geometry: &Geometry, grad_output: &[f32]) -> Vec<f32> {
-    let positions = geometry.output_height * geometry.output_width;
-    let of_channel = |channel: usize| {
-        let mut sums = [0f32; 16];
-        let mut total = 0f64;
-        for image in 0..geometry.batch {
-            let values = &grad_output[image * geometry.output_size() + channel * positions..][..positions];
-            // Sixteen short sums side by side, gathered in f64 before they grow long enough to lose digits.
-            for block in values.chunks(4096) {
-                let vectors = block.chunks_exact(16);
-                total += vectors.remainder().iter().map(|&value| f64::from(value)).sum::<f64>();
-                for vector in vectors {
-                    for (sum, value) in sums.iter_mut().zip(vector) {
-                        *sum += value;
-                    }
-                }
-                total += sums.iter().map(|&sum| f64::from(sum)).sum::<f64>();
-                sums = [0.0; 16];
-            }
-        }
-        total as f32
-    };
-    (0..geometry.output_channels).into_par_iter().map(of_channel).collect()
-}
-
 /// Per-thread buffers that outlive a call.
 #[derive(Default)]
 struct Scratch {
@@ -122,10 +96,10 @@ struct WeightJob<'a> {
 
 impl tile::Job for WeightJob<'_> {
     #[inline(always)]
-    unsafe fn run<V: Vector>(self) {
+    unsafe fn run<V: Registers>(self) {
         let (geometry, source) = (self.geometry, self.source);
-        let vectors = self.output_channels.len().div_ceil(V::LANES);
-        let width = vectors * V::LANES;
+        let vectors = self.output_channels.len().div_ceil(V::COUNT);
+        let width = vectors * V::COUNT;
         let taps: Vec<usize> = (0..geometry.kernel_height)
             .flat_map(|ky| (0..geometry.kernel_width).map(move |kx| source.offset(ky, kx)))
             .collect();
@@ -139,9 +113,9 @@ impl tile::Job for WeightJob<'_> {
 
         let Scratch { strip, gradients, sums } = self.scratch;
         let strip_positions = source.strip * geometry.output_width;
-        // Zeros where the last vector has no channel: what is left there from another task might not be finite.
-        gradients.clear();
-        gradients.resize(strip_positions * width, 0.0);
+        if gradients.len() < strip_positions * width {
+            gradients.resize(strip_positions * width, 0.0);
+        }
         if sums.len() < weights * width {
             sums.resize(weights * width, 0.0);
         }
@@ -151,7 +125,13 @@ impl tile::Job for WeightJob<'_> {
             let grad_output = &self.grad_output[image * geometry.output_size()..][..geometry.output_size()];
             for index in 0..source.strips() {
                 let rows = source.rows_of_strip(index);
-                source.fill(input, self.input_channels.clone(), rows.clone(), 0, strip);
+                let strip = if source.is_in_place() {
+                    let first = self.input_channels.start * source.channel_size() + rows.start * source.pitch();
+                    input[first..].as_ptr()
+                } else {
+                    source.fill(input, self.input_channels.clone(), rows.clone(), 0, strip);
+                    strip.as_ptr()
+                };
                 let plane = geometry.output_height * geometry.output_width;
                 let first = self.output_channels.start * plane + rows.start * geometry.output_width;
                 // Gradients as [position, channel].
@@ -171,7 +151,7 @@ impl tile::Job for WeightJob<'_> {
                     // all positions of `rows`; gradients and sums were sized for these vectors just above; the caller
                     // vouches for V.
                     unsafe {
-                        let mut rows_of_product = [strip.as_ptr(); MOST_ROWS];
+                        let mut rows_of_product = [strip; MOST_ROWS];
                         for (m, row) in rows_of_product.iter_mut().enumerate() {
                             *row = row.add(*starts.get_unchecked(weight + m));
                         }
