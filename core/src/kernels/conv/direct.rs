@@ -285,6 +285,7 @@ impl tile::Job for StripJob<'_> {
         if sums.len() < TILES * tile_sums {
             sums.resize(TILES * tile_sums, 0.0);
         }
+        let sums = sums.as_mut_ptr();
         let channel_size = plan.size[0] * plan.size[1];
         // SAFETY: `channels` starts inside the result.
         let result = unsafe { result.0.add(channels.start * channel_size) };
@@ -327,7 +328,8 @@ impl tile::Job for StripJob<'_> {
                         to.out_stride = channel_size;
                         pieces.truncate(first);
                     } else {
-                        to.out = sums[index * tile_sums..].as_mut_ptr();
+                        // SAFETY: `sums` has room for TILES tiles.
+                        to.out = unsafe { sums.add(index * tile_sums) };
                         to.out_stride = width;
                     }
                     to.pieces = first..pieces.len();
