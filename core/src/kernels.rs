@@ -15,6 +15,8 @@ use crate::{
 
 #[cfg(test)]
 mod agreement;
+
+pub mod activation;
 pub mod autograd;
 pub mod composed;
 pub mod conv;
