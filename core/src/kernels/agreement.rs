@@ -32,30 +32,27 @@ struct Answer {
     film: Vec<f64>,
 }
 
-trait Number: plain_number::Number {}
-impl<T: plain_number::Number> Number for T {}
+/// f32 or f64, to and from f64.
+trait Number: Copy {
+    fn from_f64(value: f64) -> Self;
+    fn to_f64(self) -> f64;
+}
 
-mod plain_number {
-    /// f32 or f64, to and from f64.
-    pub trait Number: Copy + Default {
-        fn from_f64(value: f64) -> Self;
-        fn to_f64(self) -> f64;
+impl Number for f64 {
+    fn from_f64(value: f64) -> Self {
+        value
     }
-    impl Number for f64 {
-        fn from_f64(value: f64) -> Self {
-            value
-        }
-        fn to_f64(self) -> f64 {
-            self
-        }
+    fn to_f64(self) -> f64 {
+        self
     }
-    impl Number for f32 {
-        fn from_f64(value: f64) -> Self {
-            value as f32
-        }
-        fn to_f64(self) -> f64 {
-            f64::from(self)
-        }
+}
+
+impl Number for f32 {
+    fn from_f64(value: f64) -> Self {
+        value as f32
+    }
+    fn to_f64(self) -> f64 {
+        f64::from(self)
     }
 }
 

@@ -24,8 +24,8 @@ mod tile;
 const CHUNK_POINTS: usize = 50 * TILE;
 /// Pieces of work that a backward pass is cut into at least, if there are points enough: each costs memory.
 const BACKWARD_PIECES: usize = 64;
-/// Partial gradients held at a time, in values (32 MiB).
-const PARTIAL_VALUES: usize = 8 << 20;
+/// Partial gradients held at a time, in values (8 MiB: first touches of fresh memory cost more than the arithmetic).
+const PARTIAL_VALUES: usize = 2 << 20;
 
 /// The fused kernel for one instruction set.
 pub struct Fused {
@@ -265,7 +265,7 @@ impl RegionKernel<f32> for Fused {
 
         gradients.weights.fill(0.0);
         gradients.film.fill(0.0);
-        let wave = (PARTIAL_VALUES / partial_len).clamp(1, cut.pieces().max(1));
+        let wave = (PARTIAL_VALUES / partial_len).max(BACKWARD_PIECES).min(cut.pieces().max(1));
         let mut partials = vec![0.0; wave * partial_len];
         for first in (0..cut.pieces()).step_by(wave) {
             let indices = first..cut.pieces().min(first + wave);

@@ -1,8 +1,8 @@
 //! Vectors of f32: the dozen operations the fused kernel needs, for each instruction set, and sine and cosine on them.
 //!
 //! Generic code over [`Lanes`] compiles to an instruction set when it is inlined whole into a function that has
-//! `#[target_feature]`; so everything here and above it is `#[inline(always)]`, and epilogues are traits, for closures
-//! cannot be (and an outlined one loses the features, at a tenth of the speed).
+//! `#[target_feature]`; so everything here and above it is `#[inline(always)]`, epilogues are traits and arrays are filled
+//! by loops: closures cannot be forced inline, and an outlined one loses the features, at a tenth of the speed.
 
 // One contract covers every method; repeating it on each would bury the code.
 #![allow(clippy::missing_safety_doc)]
@@ -91,22 +91,33 @@ mod x86 {
         }
         #[inline(always)]
         unsafe fn sum_rows(rows: *const f32, sums: *mut f32) {
-            // Three rounds of "interleave two and add": pairs of rows, then fours, then the 128-bit quarters.
             unsafe {
-                let fours: [__m512; 4] = std::array::from_fn(|four| {
-                    let row = |index: usize| _mm512_loadu_ps(rows.add((4 * four + index) * 16));
-                    let pair = |a, b| _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b));
-                    let (ab, cd) = (pair(row(0), row(1)), pair(row(2), row(3)));
-                    let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
-                    let (low, high) = (_mm512_unpacklo_pd(ab, cd), _mm512_unpackhi_pd(ab, cd));
-                    _mm512_add_ps(_mm512_castpd_ps(low), _mm512_castpd_ps(high))
-                });
-                let quarters =
-                    |a, b| _mm512_add_ps(_mm512_shuffle_f32x4::<0x88>(a, b), _mm512_shuffle_f32x4::<0xdd>(a, b));
-                let halves = (quarters(fours[0], fours[1]), quarters(fours[2], fours[3]));
-                _mm512_storeu_ps(sums, quarters(halves.0, halves.1));
+                let low = add_quarters512(add_four512(rows), add_four512(rows.add(4 * 16)));
+                let high = add_quarters512(add_four512(rows.add(8 * 16)), add_four512(rows.add(12 * 16)));
+                _mm512_storeu_ps(sums, add_quarters512(low, high));
             }
         }
+    }
+
+    /// From four rows a, b, c, d of 16: partial sums (a, b, c, d) in each 128-bit quarter.
+    #[inline(always)]
+    #[allow(clippy::undocumented_unsafe_blocks)]
+    unsafe fn add_four512(rows: *const f32) -> __m512 {
+        unsafe {
+            let (a, b) = (_mm512_loadu_ps(rows), _mm512_loadu_ps(rows.add(16)));
+            let (c, d) = (_mm512_loadu_ps(rows.add(32)), _mm512_loadu_ps(rows.add(48)));
+            let ab = _mm512_castps_pd(_mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)));
+            let cd = _mm512_castps_pd(_mm512_add_ps(_mm512_unpacklo_ps(c, d), _mm512_unpackhi_ps(c, d)));
+            let (low, high) = (_mm512_unpacklo_pd(ab, cd), _mm512_unpackhi_pd(ab, cd));
+            _mm512_add_ps(_mm512_castpd_ps(low), _mm512_castpd_ps(high))
+        }
+    }
+
+    /// Quarters (a0 + a1, a2 + a3, b0 + b1, b2 + b3).
+    #[inline(always)]
+    #[allow(clippy::undocumented_unsafe_blocks)]
+    unsafe fn add_quarters512(a: __m512, b: __m512) -> __m512 {
+        unsafe { _mm512_add_ps(_mm512_shuffle_f32x4::<0x88>(a, b), _mm512_shuffle_f32x4::<0xdd>(a, b)) }
     }
 
     #[allow(clippy::undocumented_unsafe_blocks)]
@@ -155,14 +166,22 @@ mod x86 {
         #[inline(always)]
         unsafe fn sum_rows(rows: *const f32, sums: *mut f32) {
             unsafe {
-                let fours: [__m256; 2] = std::array::from_fn(|four| {
-                    let row = |index: usize| _mm256_loadu_ps(rows.add((4 * four + index) * 8));
-                    _mm256_hadd_ps(_mm256_hadd_ps(row(0), row(1)), _mm256_hadd_ps(row(2), row(3)))
-                });
-                let low = _mm256_permute2f128_ps::<0x20>(fours[0], fours[1]);
-                let high = _mm256_permute2f128_ps::<0x31>(fours[0], fours[1]);
+                let (first, second) = (add_four256(rows), add_four256(rows.add(4 * 8)));
+                let low = _mm256_permute2f128_ps::<0x20>(first, second);
+                let high = _mm256_permute2f128_ps::<0x31>(first, second);
                 _mm256_storeu_ps(sums, _mm256_add_ps(low, high));
             }
+        }
+    }
+
+    /// From four rows a, b, c, d of 8: partial sums (a, b, c, d) in each 128-bit half.
+    #[inline(always)]
+    #[allow(clippy::undocumented_unsafe_blocks)]
+    unsafe fn add_four256(rows: *const f32) -> __m256 {
+        unsafe {
+            let ab = _mm256_hadd_ps(_mm256_loadu_ps(rows), _mm256_loadu_ps(rows.add(8)));
+            let cd = _mm256_hadd_ps(_mm256_loadu_ps(rows.add(16)), _mm256_loadu_ps(rows.add(24)));
+            _mm256_hadd_ps(ab, cd)
         }
     }
 }
@@ -286,8 +305,11 @@ unsafe fn subtract_pi_multiple<V: Lanes>(x: V, multiple: V) -> V {
             multiple.neg_mul_add(V::splat(-8.742_278e-8), remainder)
         } else {
             // 11 bits each (half multiples have one more): products with 12-bit multiples are exact in f32.
-            let parts = PI_PARTS.map(|part| V::splat(part));
-            parts.into_iter().fold(x, |remainder, part| multiple.neg_mul_add(part, remainder))
+            let mut remainder = x;
+            for part in PI_PARTS {
+                remainder = multiple.neg_mul_add(V::splat(part), remainder);
+            }
+            remainder
         }
     }
 }

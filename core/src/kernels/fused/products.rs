@@ -89,13 +89,12 @@ unsafe fn multiply_panel<V: Lanes, const ROWS: usize, const VECTORS: usize, E: E
         unsafe {
             let mut sums = [[V::splat(0.0); VECTORS]; ROWS];
             if !offset.is_null() {
-                let start: [V; VECTORS] = std::array::from_fn(|v| V::load(offset.add(column + v * V::COUNT)));
-                sums = [start; ROWS];
+                sums = [load_all::<V, VECTORS>(offset.add(column)); ROWS];
             }
             let mut left_at = left.start.add(row * left.row_stride);
             let mut panel_at = panel;
             for _ in 0..left.inner {
-                let right: [V; VECTORS] = std::array::from_fn(|v| V::load(panel_at.add(v * V::COUNT)));
+                let right = load_all::<V, VECTORS>(panel_at);
                 for (r, sums) in sums.iter_mut().enumerate() {
                     let scale = V::splat(*left_at.add(r * left.row_stride));
                     for (sum, right) in sums.iter_mut().zip(right) {
@@ -113,6 +112,18 @@ unsafe fn multiply_panel<V: Lanes, const ROWS: usize, const VECTORS: usize, E: E
             }
         }
         row += ROWS;
+    }
+}
+
+#[inline(always)]
+unsafe fn load_all<V: Lanes, const VECTORS: usize>(source: *const f32) -> [V; VECTORS] {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let mut vectors = [V::splat(0.0); VECTORS];
+        for (v, vector) in vectors.iter_mut().enumerate() {
+            *vector = V::load(source.add(v * V::COUNT));
+        }
+        vectors
     }
 }
 
@@ -187,7 +198,7 @@ unsafe fn outer_block<V: Lanes, const ROWS: usize, const VECTORS: usize>(
         let mut sums = [[V::splat(0.0); VECTORS]; ROWS];
         let (mut left_at, mut right_at) = (left.start, right);
         for _ in 0..left.inner {
-            let right: [V; VECTORS] = std::array::from_fn(|v| V::load(right_at.add(v * V::COUNT)));
+            let right = load_all::<V, VECTORS>(right_at);
             for (r, sums) in sums.iter_mut().enumerate() {
                 let scale = V::splat(*left_at.add(r * left.row_stride));
                 for (sum, right) in sums.iter_mut().zip(right) {
