@@ -180,6 +180,8 @@ fn cases() -> Vec<Case> {
         };
         cases.push(Case::new(head_shape(width, variant), ALL, extent, index as u64));
     }
+    // More pieces of work than a backward pass holds partial gradients for at a time.
+    cases.push(Case::new(head_shape(130, 0), ALL, Extent { images: 12, regions: 6, points: 1 }, 99));
     for bits in 0..8 {
         let outputs = Outputs { gradient: bits & 1 != 0, colour: bits & 2 != 0, activations: bits & 4 != 0 };
         for variant in 0..8 {
