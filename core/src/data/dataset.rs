@@ -200,6 +200,20 @@ impl Dataset {
     }
 }
 
+/// The cameras a `dataset.json` lists for its pictures, in our form or StyleGAN's; the pictures need not be there.
+pub fn read_cameras(path: &Path) -> Result<Vec<(String, Camera)>> {
+    let bytes = picture::read_file(path, MAX_INDEX_BYTES)?;
+    let folder = Files::Folder(path.parent().unwrap_or(Path::new(".")).to_owned());
+    let cameras = Index::parse(&bytes, path, &folder)?.entries.into_iter().filter_map(|entry| {
+        let camera = entry.camera?;
+        Some(match index::camera_fault(&camera) {
+            Some(fault) => Err(Error::malformed(path, format!("`{}`: its camera's {fault}", entry.image))),
+            None => Ok((entry.image, camera)),
+        })
+    });
+    cameras.collect()
+}
+
 /// What [`Dataset::check`] found.
 #[derive(Debug, Default)]
 pub struct CheckReport {

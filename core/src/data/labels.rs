@@ -101,8 +101,8 @@ pub fn class_region(name: &str) -> Option<Region> {
     Some(match name.as_str() {
         "background" | "bg" => Region::Background,
         "face" | "skin" => Region::Face,
-        "eyes" | "eye" | "glasses" | "eye_g" | "eyeglasses" | "eye_glasses" => Region::Eyes,
-        "eyebrows" | "eyebrow" | "brows" => Region::Eyebrows,
+        "eyes" | "eye" | "glasses" | "eye_g" | "eyeglass" | "eyeglasses" | "eye_glasses" => Region::Eyes,
+        "eyebrows" | "eyebrow" | "brow" | "brows" => Region::Eyebrows,
         "mouth" | "u_lip" | "l_lip" | "upper_lip" | "lower_lip" | "inner_mouth" => Region::Mouth,
         "nose" => Region::Nose,
         "ears" | "ear" | "earring" | "earrings" | "ear_r" => Region::Ears,

@@ -9,7 +9,10 @@ use std::{collections::HashMap, path::Path};
 
 use candle_core::{DType, Device, Tensor};
 
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    kernels::conv::conv2d,
+};
 
 /// Per-channel mean of the classifiers' training pictures, in [-1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
@@ -203,7 +206,7 @@ impl Perceptual {
             match step {
                 Step::Convolve(index, stride, padding) => {
                     let Some((weight, bias)) = self.convolutions.get(index) else { continue };
-                    features = convolve(&features, weight, bias, stride, padding)?.relu()?;
+                    features = conv2d(&features, weight, Some(bias), stride, padding)?.relu()?;
                 }
                 Step::Pool(window) => features = max_pool(&features, window, 2)?,
                 Step::Tap => taps.push(features.clone()),
@@ -239,12 +242,6 @@ impl Perceptual {
 fn unit_length(features: &Tensor) -> Result<Tensor> {
     let length = (features.sqr()?.sum_keepdim(1)? + NORM_FLOOR)?.sqrt()?;
     Ok(features.broadcast_div(&length)?)
-}
-
-/// `[B, C, H, W]` by `[O, C, k, k]` plus `[O]`.
-fn convolve(input: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize, padding: usize) -> Result<Tensor> {
-    let output = input.conv2d(weight, padding, stride, 1, 1)?;
-    Ok(output.broadcast_add(&bias.reshape((1, (), 1, 1))?)?)
 }
 
 /// Largest value of each `window` × `window` patch, every `stride` pixels, without padding: `[B, C, H, W]` to
