@@ -188,12 +188,17 @@ impl InstructionSet {
         }
     }
 
-    /// Values in one register.
-    fn lanes(self) -> usize {
+    /// Values in one register, and registers side by side in a product.
+    fn lanes_and_vectors(self) -> (usize, usize) {
+        fn of<V: tile::Registers>() -> (usize, usize) {
+            (V::COUNT, V::VECTORS)
+        }
         match self {
-            Self::Portable => 4,
-            Self::Avx2 => 8,
-            Self::Avx512 => 16,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => of::<std::arch::x86_64::__m512>(),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => of::<std::arch::x86_64::__m256>(),
+            _ => of::<kernels::simd::Portable>(),
         }
     }
 }

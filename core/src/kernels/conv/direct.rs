@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use super::InstructionSet;
 use super::geometry::{Geometry, PaddedSource};
-use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Registers};
+use super::tile::{self, MOST_ROWS, Product, Registers};
 
 /// Values of one strip: about half of a second-level cache of 1 MB, the rest is for weights and sums.
 const STRIP_VALUES: usize = 128_000;
@@ -274,7 +274,7 @@ impl tile::Job for StripJob<'_> {
     unsafe fn run<V: Registers>(self) {
         let Self { plan, image, bias, rows, channels, result, scratch: Scratch { strip, sums, pieces } } = self;
         let source = &plan.source;
-        let width = MOST_VECTORS * V::COUNT;
+        let width = V::VECTORS * V::COUNT;
         let strip = if source.is_in_place() {
             image[rows.start * source.pitch()..].as_ptr()
         } else {
@@ -298,7 +298,7 @@ impl tile::Job for StripJob<'_> {
         let (segments, length) = if by_row { (rows.len(), columns) } else { (1, all) };
         // Tiles as equal as can be: four vectors are two and two, because a single one leaves the processor waiting.
         let vectors = length.div_ceil(V::COUNT);
-        let per_segment = vectors.div_ceil(MOST_VECTORS);
+        let per_segment = vectors.div_ceil(V::VECTORS);
 
         for phase in &plan.phases {
             let mut tile = 0;
@@ -366,7 +366,7 @@ impl Plan<'_> {
     ) {
         let summands = phase.offsets.len();
         let taps = (summands / self.source.channels).max(1);
-        let tile_values = MOST_VECTORS * V::COUNT * self.source.kernel[0];
+        let tile_values = V::VECTORS * V::COUNT * self.source.kernel[0];
         let block = (BLOCK_VALUES / tile_values).max(1) * taps;
         let mut first = 0;
         loop {

@@ -6,8 +6,6 @@ use crate::kernels::simd::{Lanes, Portable};
 
 /// Most rows that one product holds in registers.
 pub(super) const MOST_ROWS: usize = 8;
-/// Most vectors that one product holds in registers, beside each other.
-pub(super) const MOST_VECTORS: usize = 3;
 
 /// Side of the squares that [`transpose`] moves at a time.
 const SQUARE: usize = 8;
@@ -17,8 +15,11 @@ const SQUARE: usize = 8;
 /// # Safety
 /// As [`Lanes`].
 pub(super) trait Registers: Lanes {
-    /// Rows of a full product: as many as leave the register file room for the operands.
+    /// Rows of a full product.
     const ROWS: usize;
+    /// Vectors of a full product: with the rows, as many sums as leave the register file room for the operands. (Filled
+    /// to the last register, compilers shuffle sums about at a third of the speed.)
+    const VECTORS: usize;
 
     /// Transposes 8 × 8 values: `to[i·to_stride + j] = from[j·from_stride + i]`.
     ///
@@ -37,6 +38,7 @@ pub(super) trait Registers: Lanes {
 
 impl Registers for Portable {
     const ROWS: usize = 4;
+    const VECTORS: usize = 2;
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -45,6 +47,7 @@ mod x86 {
 
     impl super::Registers for __m512 {
         const ROWS: usize = 8;
+        const VECTORS: usize = 3;
 
         #[inline(always)]
         unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
@@ -54,7 +57,8 @@ mod x86 {
     }
 
     impl super::Registers for __m256 {
-        const ROWS: usize = 4;
+        const ROWS: usize = 6;
+        const VECTORS: usize = 2;
 
         #[inline(always)]
         unsafe fn transpose_square(from: *const f32, from_stride: usize, to: *mut f32, to_stride: usize) {
@@ -207,7 +211,7 @@ pub(super) fn rows_of_next<V: Registers>(left: usize) -> usize {
     }
 }
 
-/// Computes `product` for `rows` rows (from [`rows_of_next`]) and `vectors` vectors (1 to [`MOST_VECTORS`]).
+/// Computes `product` for `rows` rows (from [`rows_of_next`]) and `vectors` vectors (1 to [`Registers::VECTORS`]).
 ///
 /// # Safety
 /// The processor has `V`'s instruction set; every address that the formula of [`Product`] names is readable, and
@@ -220,10 +224,12 @@ pub(super) unsafe fn multiply<V: Registers>(rows: usize, vectors: usize, product
             (8, 3) if V::ROWS == 8 => tile::<V, 8, 3>(product),
             (8, 2) if V::ROWS == 8 => tile::<V, 8, 2>(product),
             (8, _) if V::ROWS == 8 => tile::<V, 8, 1>(product),
-            (4, 3) => tile::<V, 4, 3>(product),
+            (6, 2) if V::ROWS == 6 => tile::<V, 6, 2>(product),
+            (6, _) if V::ROWS == 6 => tile::<V, 6, 1>(product),
+            (4, 3) if V::VECTORS == 3 => tile::<V, 4, 3>(product),
             (4, 2) => tile::<V, 4, 2>(product),
             (4, _) => tile::<V, 4, 1>(product),
-            (_, 3) => tile::<V, 1, 3>(product),
+            (_, 3) if V::VECTORS == 3 => tile::<V, 1, 3>(product),
             (_, 2) => tile::<V, 1, 2>(product),
             (_, _) => tile::<V, 1, 1>(product),
         }

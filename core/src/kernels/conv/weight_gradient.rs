@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::InstructionSet;
 use super::direct::SharedOutput;
 use super::geometry::{Geometry, PaddedSource};
-use super::tile::{self, MOST_ROWS, MOST_VECTORS, Product, Registers};
+use super::tile::{self, MOST_ROWS, Product, Registers};
 
 /// Positions summed between two visits to the sums in memory: their gradients, for three vectors of channels, fill
 /// most of a first-level cache.
@@ -31,14 +31,14 @@ pub(super) fn weight_gradient(
     let mut source = PaddedSource::of_input(geometry);
     source.strip = (STRIP_POSITIONS / geometry.output_width).clamp(1, geometry.output_height);
 
-    // Output channels in chunks of one to three vectors, as equal as can be; then input channels, as needed to keep
+    // Output channels in chunks of a product's vectors, as equal as can be; then input channels, as needed to keep
     // the sums near and to give every thread a share.
-    let lanes = instruction_set.lanes();
+    let (lanes, most_vectors) = instruction_set.lanes_and_vectors();
     let vectors = geometry.output_channels.div_ceil(lanes);
-    let chunks = vectors.div_ceil(MOST_VECTORS);
+    let chunks = vectors.div_ceil(most_vectors);
     let threads = rayon::current_num_threads();
     let groups = threads.div_ceil(chunks).min(geometry.input_channels);
-    let most = (SUMS / (geometry.taps() * MOST_VECTORS * lanes)).max(1);
+    let most = (SUMS / (geometry.taps() * most_vectors * lanes)).max(1);
     let group = geometry.input_channels.div_ceil(groups).min(most);
     let groups = geometry.input_channels.div_ceil(group);
 
@@ -88,7 +88,7 @@ struct WeightJob<'a> {
     input: &'a [f32],
     grad_output: &'a [f32],
     input_channels: Range<usize>,
-    /// At most [`MOST_VECTORS`] vectors of them.
+    /// At most [`Registers::VECTORS`] vectors of them.
     output_channels: Range<usize>,
     result: SharedOutput,
     scratch: &'a mut Scratch,
