@@ -1,6 +1,7 @@
 //! Other programs' files: the authors' checkpoints, meshes, animations.
 
 pub mod animation;
+pub mod authors;
 pub mod authors_nets;
 pub mod mesh;
 pub mod sheet;
