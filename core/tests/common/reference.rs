@@ -27,11 +27,9 @@ pub struct Reference {
 /// All seeds in `CNERF_REFERENCE`, by default `shared/reference` beside the repository; none, with a word why, if
 /// the folder is not there.
 pub fn references() -> Vec<Reference> {
-    let folder = std::env::var_os("CNERF_REFERENCE").map(PathBuf::from).unwrap_or_else(|| {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-        let beside = root.join("shared/reference");
-        if beside.is_dir() { beside } else { root.join("../shared/reference") }
-    });
+    let folder = std::env::var_os("CNERF_REFERENCE")
+        .map(PathBuf::from)
+        .unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/reference"));
     let Ok(entries) = std::fs::read_dir(&folder) else {
         println!("skipped: no reference at {}; set CNERF_REFERENCE", folder.display());
         return Vec::new();

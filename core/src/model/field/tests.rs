@@ -222,3 +222,45 @@ fn masks_are_shares_with_softmax() {
     let sums = masks.sum(1).unwrap();
     assert!(difference(&sums, &sums.ones_like().unwrap()) < 1e-14);
 }
+
+/// A loss of everything a picture has, differentiated to cameras, codes, points' weights and α.
+#[test]
+fn gradients_of_pictures_match_finite_differences() {
+    for form in [config(FieldConfig::ours()), config(FieldConfig::paper())] {
+        let parameters = Parameters::fresh(4, DType::F64, &Device::Cpu);
+        let field = Field::new(&form, &parameters).unwrap();
+        let settings = RenderSettings { resolution: 3, differentiable: true, ..settings(&form) };
+        let camera = [[0.2, -0.1, 0.05, 0.02, -0.03, 0.1]];
+        let loss = |camera: &Tensor, codes: &Tensor| {
+            let frame = render_frame(&field.portraits(codes).unwrap(), camera, &settings).unwrap();
+            let parts = [frame.colour, frame.features.unwrap(), frame.masks, frame.depth, frame.normal.unwrap()];
+            let terms = parts.iter().map(|part| part.flatten_all()?.sin()?.sum_all());
+            terms.reduce(|sum, term| sum? + term?).unwrap().unwrap()
+        };
+        let camera = candle_core::Var::new(&camera, &Device::Cpu).unwrap();
+        let codes = candle_core::Var::from_tensor(&codes(1, 1, DType::F64)).unwrap();
+        let gradients = loss(&camera, &codes).backward().unwrap();
+        let mut inputs = parameters.variables();
+        inputs.extend([("camera".to_owned(), camera.clone()), ("codes".to_owned(), codes.clone())]);
+        for (name, variable) in inputs {
+            let gradient = gradients.get(&variable).unwrap_or_else(|| panic!("nothing reaches {name}"));
+            let gradient: Vec<f64> = gradient.flatten_all().unwrap().to_vec1().unwrap();
+            let values: Vec<f64> = variable.flatten_all().unwrap().to_vec1().unwrap();
+            // Two values of each tensor: the largest gradient and one drawn at random.
+            let largest = (0..values.len()).max_by(|a, b| gradient[*a].abs().total_cmp(&gradient[*b].abs())).unwrap();
+            for index in [largest, Stream::new(5, &[]).below(values.len())] {
+                let step = 1e-6;
+                let moved = |step: f64| {
+                    let mut values = values.clone();
+                    values[index] += step;
+                    variable.set(&Tensor::from_vec(values, variable.shape(), &Device::Cpu).unwrap()).unwrap();
+                    loss(&camera, &codes).to_scalar::<f64>().unwrap()
+                };
+                let expected = (moved(step) - moved(-step)) / (2.0 * step);
+                moved(0.0);
+                let error = (gradient[index] - expected).abs();
+                assert!(error < 1e-6 + 1e-5 * expected.abs(), "{name}[{index}]: {} {expected}", gradient[index]);
+            }
+        }
+    }
+}
