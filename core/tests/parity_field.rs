@@ -13,15 +13,22 @@ use cnerf_core::{
     camera::{self, CAMERA_PARAMETERS, Camera, FIELD_OF_VIEW_RAD, INPUT_SCALE},
     codes,
     config::{DensityKind, FieldConfig, InitialDistance},
-    interop::authors::{AUTHORS_ORDER, authors_places, codes_from_authors, import_authors_field, permute_regions},
+    interop::{
+        authors::{AUTHORS_ORDER, authors_places, codes_from_authors, import_authors_field, permute_regions},
+        authors_nets::{discriminator_config, discriminator_weights},
+    },
     model::{
+        discriminator::{Discriminator, DiscriminatorKind, class_labels, select_masks},
         field::{Field, PortraitField},
         mapping::{MAPPING_LAYERS, Mapping},
     },
     parameters::Parameters,
-    region::RegionSet,
+    region::{Region, RegionSet},
     render::{Outputs, RadianceField, RayBundle, RayOutput, Sampling, render_rays},
-    train::losses,
+    train::{
+        adversarial::{Auxiliary, GeneratorLoss, Pictures, generator_terms},
+        losses,
+    },
 };
 use reference::{GRADIENTS, Reference, Table, VALUES, references};
 
@@ -77,6 +84,14 @@ fn wcodes(reference: &Reference, dtype: DType) -> Tensor {
     codes_from_authors(&reference.input("map/wcodes", dtype)).unwrap()
 }
 
+/// The codes of one z per region and aspect, `[B, 18, D]` in the authors' order.
+fn mapped_codes(reference: &Reference, mapping: &Mapping, dtype: DType) -> Tensor {
+    let z = reference.input("in/z_codes", dtype);
+    let (rows, batch, style_dim) = z.dims3().unwrap();
+    let w = mapping.forward(&z.reshape((rows * batch, style_dim)).unwrap()).unwrap();
+    w.reshape((rows, batch, style_dim)).unwrap().transpose(0, 1).unwrap().contiguous().unwrap()
+}
+
 /// `[B, C, H, W]` of the authors as `[B, C, R]`.
 fn pixels(tensor: &Tensor) -> Tensor {
     tensor.flatten_from(2).unwrap()
@@ -95,10 +110,7 @@ fn parity_mapping() {
             let map = |name: &str| mapping.forward(&reference.input(name, dtype)).unwrap();
             table.compare("map/w", &map("in/z"), &reference.expected("map/w"), VALUES);
             table.compare("map/w2", &map("in/z2"), &reference.expected("map/w2"), VALUES);
-            let z = reference.input("in/z_codes", dtype);
-            let (rows, batch, style_dim) = z.dims3().unwrap();
-            let w = mapping.forward(&z.reshape((rows * batch, style_dim)).unwrap()).unwrap();
-            let w = w.reshape((rows, batch, style_dim)).unwrap().transpose(0, 1).unwrap().contiguous().unwrap();
+            let w = mapped_codes(&reference, &mapping, dtype);
             table.compare("map/wcodes", &w, &reference.expected("map/wcodes"), VALUES);
             let mean = map("in/mean_z").mean_keepdim(0).unwrap();
             table.compare("map/mean_w", &mean, &reference.expected("map/mean_w"), VALUES);
@@ -339,11 +351,7 @@ fn parity_eikonal_gradients() {
         for dtype in PRECISIONS {
             let mut table = Table::new(&reference, &title("stage 1", dtype));
             let authors = authors(&reference, dtype);
-            let z = reference.input("in/z_codes", dtype);
-            let (rows, batch, style_dim) = z.dims3().unwrap();
-            let w = authors.mapping.forward(&z.reshape((rows * batch, style_dim)).unwrap()).unwrap();
-            let w = w.reshape((rows, batch, style_dim)).unwrap().transpose(0, 1).unwrap().contiguous().unwrap();
-            let codes = codes_from_authors(&w).unwrap();
+            let codes = codes_from_authors(&mapped_codes(&reference, &authors.mapping, dtype)).unwrap();
             let sampling = Sampling::authors(reference.number("n_samples"));
             let depths = training_depths(&reference, &sampling, "train", dtype);
             let points = rays(&reference, dtype).points(&depths).unwrap();
@@ -360,22 +368,107 @@ fn parity_eikonal_gradients() {
             let loss = ((eikonal * 0.1).unwrap() + (surface * 0.001).unwrap()).unwrap();
             let gradients = named_gradients(&authors.parameters, &loss.backward().unwrap());
             for group in ["style", "renderer.network.3"] {
-                let prefix = format!("g1/grad_eik/{group}.");
-                let names = reference.names(&prefix);
-                assert!(!names.is_empty());
-                let pairs: Vec<(Tensor, Tensor)> = names
-                    .iter()
-                    .map(|name| {
-                        let expected = reference.expected(name);
-                        let ours = authors_gradient(&gradients, name.trim_start_matches("g1/grad_eik/"));
-                        (ours.unwrap_or_else(|| expected.zeros_like().unwrap()), expected)
-                    })
-                    .collect();
-                table.compare_all(&format!("g1/grad_eik/{group}"), &pairs, GRADIENTS);
+                compare_gradients(&mut table, &reference, "g1/grad_eik", group, &gradients);
             }
             table.finish();
         }
     }
+}
+
+/// Gradients of all the authors' parameters below `group`; where nothing reaches ours, theirs must be 0.
+fn compare_gradients(
+    table: &mut Table,
+    reference: &Reference,
+    part: &str,
+    group: &str,
+    gradients: &HashMap<String, Tensor>,
+) {
+    let names = reference.names(&format!("{part}/{group}."));
+    assert!(!names.is_empty(), "{part}/{group}");
+    let pair = |name: &String| {
+        let expected = reference.expected(name);
+        let ours = authors_gradient(gradients, name.strip_prefix(part).unwrap().trim_start_matches('/'));
+        (ours.unwrap_or_else(|| expected.zeros_like().unwrap()), expected)
+    };
+    let pairs: Vec<(Tensor, Tensor)> = names.iter().map(pair).collect();
+    table.compare_all(&format!("{part}/{group}"), &pairs, GRADIENTS);
+}
+
+/// The whole loss of their first stage's generator step, and the gradients of every weight.
+///
+/// Gradients need to agree in one precision only. Among the discriminators' 1e5 leaky ReLUs there may be one that
+/// rounding puts on the other side of its kink (in tiny_s0 one lies at 1e-8), which turns the masks' small gradients
+/// by 1e-3 to 1e-2; their f32 is then on the side of our f32 or of our f64.
+#[test]
+fn parity_stage_1_generator_step() {
+    for reference in references() {
+        let tables = PRECISIONS.map(|dtype| stage_1_generator_step(&reference, dtype));
+        if tables.iter().all(|table| !table.passes()) {
+            tables.into_iter().for_each(Table::finish);
+        }
+    }
+}
+
+/// Fails on values; returns the table of gradients.
+fn stage_1_generator_step(reference: &Reference, dtype: DType) -> Table {
+    let mut table = Table::new(reference, &title("stage 1", dtype));
+    let authors = authors(reference, dtype);
+    let codes = codes_from_authors(&mapped_codes(reference, &authors.mapping, dtype)).unwrap();
+    let field = authors.field.portraits(&codes).unwrap().with_frozen_initial_distance();
+    let sampling = Sampling::authors(reference.number("n_samples"));
+    let depths = sampling.regular(dtype, &Device::Cpu).unwrap();
+    let rays = rays(reference, dtype);
+    let output = render_rays(&field, &rays, &depths, &sampling, Outputs::default(), RegionSet::ALL).unwrap();
+    let residuals = authors.residuals_only.portraits(&codes).unwrap();
+    let slope = residuals.evaluate(&rays.points(&depths).unwrap(), None, ALL).unwrap().gradient.unwrap();
+
+    let resolution = reference.number("render_res");
+    let picture = |pixels: &Tensor| {
+        let (batch, channels, _) = pixels.dims3().unwrap();
+        pixels.reshape((batch, channels, resolution, resolution)).unwrap()
+    };
+    let (image, masks) = (picture(&output.colour), picture(&output.masks));
+    let judge = |part: &str, kind, masks: &Tensor, auxiliary| -> GeneratorLoss {
+        let state = reference.state("vol_renderer", part);
+        let config = discriminator_config(kind, &state).unwrap();
+        let weights = discriminator_weights(&config, &state).unwrap();
+        let network = Discriminator::new(&config, &Parameters::loaded(weights, dtype, &Device::Cpu)).unwrap();
+        generator_terms(&network, Pictures { image: &image, masks }, auxiliary).unwrap()
+    };
+    let angles_rad = reference.input("in/viewpoint", dtype);
+    let view = Auxiliary::View { angles_rad: &angles_rad, weight: 15.0 };
+    let global = judge("gd", DiscriminatorKind::Global, &masks, view);
+    let labels = reference.input("in/g_label", DType::I64).to_vec1::<i64>().unwrap();
+    let regions: Vec<Region> = labels.into_iter().map(|label| AUTHORS_ORDER[label as usize]).collect();
+    let labels = class_labels(&regions, &Device::Cpu).unwrap();
+    let class = Auxiliary::Class { labels: &labels, weight: 1.0 };
+    let semantic = judge("sd", DiscriminatorKind::Semantic, &select_masks(&masks, &regions).unwrap(), class);
+    let eikonal = losses::eikonal(&slope).unwrap();
+    let surface = losses::minimal_surface(&output.evaluation.distance, losses::MINIMAL_SURFACE_SHARPNESS).unwrap();
+    for (name, value) in [
+        ("g1/gan", &global.adversarial),
+        ("g1/view", global.auxiliary.as_ref().unwrap()),
+        ("g1/gan_sem", &semantic.adversarial),
+        ("g1/classify", semantic.auxiliary.as_ref().unwrap()),
+    ] {
+        table.compare(name, value, &reference.expected(name), VALUES);
+    }
+    let geometry = ((eikonal * 0.1).unwrap() + (surface * 0.001).unwrap()).unwrap();
+    let total = ((global.total + semantic.total).unwrap() + geometry).unwrap();
+    table.compare("g1/total", &total, &reference.expected("g1/total"), VALUES);
+
+    let mut table = Table::new(reference, &title("stage 1", dtype));
+    let gradients = named_gradients(&authors.parameters, &total.backward().unwrap());
+    // Ours is d / d ln α; theirs d / d α.
+    let alpha = authors.field.alpha().unwrap().detach();
+    let of_alpha = (&gradients["field.log_alpha"] / alpha).unwrap();
+    let expected = reference.expected("g1/grad/renderer.sigmoid_beta");
+    table.compare("g1/grad/renderer.sigmoid_beta", &of_alpha, &expected, GRADIENTS);
+    compare_gradients(&mut table, reference, "g1/grad", "style", &gradients);
+    for place in 0..9 {
+        compare_gradients(&mut table, reference, "g1/grad", &format!("renderer.network.{place}"), &gradients);
+    }
+    table
 }
 
 fn named_gradients(parameters: &Parameters, gradients: &GradStore) -> HashMap<String, Tensor> {

@@ -133,6 +133,11 @@ impl Table {
         }
     }
 
+    /// Whether nothing was too far off so far.
+    pub fn passes(&self) -> bool {
+        self.failures.is_empty()
+    }
+
     pub fn finish(self) {
         assert!(self.failures.is_empty(), "{}: {}", self.title, self.failures.join("; "));
     }
