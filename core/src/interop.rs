@@ -2,7 +2,9 @@
 
 pub mod animation;
 pub mod authors;
+pub mod authors_checkpoint;
 pub mod authors_nets;
 pub mod mesh;
 pub mod sheet;
+pub mod surface;
 pub mod torch;

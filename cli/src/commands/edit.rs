@@ -77,7 +77,7 @@ impl EditArguments {
         let model = portraits::model_of(&portrait, &self.portrait, &self.model)?;
         let mut sources = Vec::new();
         for (edit, path) in edits {
-            let other = path.map(Portrait::load).transpose()?;
+            let other = path.map(|path| Portrait::load(path)).transpose()?;
             if let (Some(other), Some(path)) = (&other, path) {
                 other.check_model(path, &model.hash()?)?;
             }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::bail;
 use clap::Args;
-use cnerf_core::{model::surface, region::RegionSet};
+use cnerf_core::{interop::surface, region::RegionSet};
 use serde::Serialize;
 
 use crate::{

@@ -130,17 +130,21 @@ pub fn parse_safetensors(name: &Path, bytes: &[u8]) -> Result<(Tensors, HashMap<
 
 /// Writes tensors and string metadata to a temporary file beside `path` and renames it.
 pub fn write_safetensors(path: &Path, tensors: &Tensors, metadata: &[(&str, String)]) -> Result<()> {
-    let buffers = tensors.iter().map(|(name, tensor)| Ok((name, raw(tensor)?))).collect::<Result<Vec<_>>>()?;
+    write_atomically(path, &safetensors_bytes(path, tensors, metadata)?)
+}
+
+/// Tensors and string metadata as the bytes of a safetensors file; `name` stands for it in messages.
+pub fn safetensors_bytes(name: &Path, tensors: &Tensors, metadata: &[(&str, String)]) -> Result<Vec<u8>> {
+    let buffers = tensors.iter().map(|(key, tensor)| Ok((key, raw(tensor)?))).collect::<Result<Vec<_>>>()?;
     let views = buffers
         .iter()
-        .map(|(name, (dtype, shape, bytes))| {
+        .map(|(key, (dtype, shape, bytes))| {
             let view = TensorView::new(*dtype, shape.clone(), bytes);
-            Ok((name.as_str(), view.map_err(|error| Error::malformed(path, error))?))
+            Ok((key.as_str(), view.map_err(|error| Error::malformed(name, error))?))
         })
         .collect::<Result<Vec<_>>>()?;
     let metadata = metadata.iter().map(|(key, value)| ((*key).to_owned(), value.clone())).collect();
-    let bytes = safetensors::serialize(views, Some(metadata)).map_err(|error| Error::malformed(path, error))?;
-    write_atomically(path, &bytes)
+    safetensors::serialize(views, Some(metadata)).map_err(|error| Error::malformed(name, error))
 }
 
 /// Writes `bytes` to a temporary file in the folder of `path` and renames it: readers see all of it or nothing.
