@@ -10,6 +10,9 @@ use super::{
 };
 use crate::region::Region;
 
+/// How far all of this stands higher than its numbers say: a short neck suits a large head.
+const LIFT: f32 = 0.1;
+
 /// Middle line of the neck at this height.
 fn neck_axis(y: f32) -> Vec3 {
     vec3(0.0, y, -0.22 - 0.1 * (-0.62 - y) / 0.98)
@@ -42,6 +45,7 @@ fn torso(builder: &mut Builder, neck: &Neck, inflate: f32) {
 pub(super) fn build(builder: &mut Builder, identity: &Identity, anatomy: &Anatomy) {
     let neck = &identity.neck;
     let radius = anatomy.neck_radius;
+    builder.offset(LIFT * Vec3::Y);
     builder.group().paint(Region::Neck, Material::Skin);
     torso(builder, neck, 0.0);
     builder.add(Shape::round_cone(neck_axis(-0.9), radius, neck_axis(-1.65), 1.08 * radius), 0.22);
@@ -63,7 +67,7 @@ pub(super) fn build(builder: &mut Builder, identity: &Identity, anatomy: &Anatom
             } else {
                 builder.paint(Region::Neck, Material::Trim);
                 let local = slope.transpose();
-                let rib = base + vec3(0.0, 0.045, 0.03);
+                let rib = base + vec3(0.0, 0.045, 0.09);
                 builder.add(Shape::Torus { centre: rib, local, ring: radius + 0.13, tube: 0.045 }, 0.01);
             }
         }
@@ -108,17 +112,21 @@ pub(super) fn build(builder: &mut Builder, identity: &Identity, anatomy: &Anatom
             builder.cut(half_space_above(base + vec3(0.0, 0.14, 0.0), slope), 0.03);
             // Two flaps that meet under the throat.
             builder.paint(Region::Neck, Material::Trim).mirrored(true);
-            let flap = [
-                (neck_axis(-1.28) + vec3(0.0, 0.02, -radius - 0.09), 0.065),
-                (neck_axis(-1.3) + vec3(radius + 0.07, 0.0, -0.05), 0.07),
-                (vec3(0.24, -1.5, 0.14), 0.075),
-                (vec3(0.12, -1.6, 0.24), 0.06),
+            let stand = [
+                (neck_axis(-1.26) + vec3(0.0, 0.02, -radius - 0.08), 0.06),
+                (neck_axis(-1.3) + vec3(radius + 0.06, 0.0, -0.05), 0.06),
+                (neck_axis(-1.42) + vec3(0.6 * radius, 0.0, 0.8 * radius + 0.06), 0.055),
             ];
-            builder.lock(&flap, 3, 0.02);
-            builder.add(Shape::round_cone(vec3(0.2, -1.52, 0.2), 0.06, vec3(0.3, -1.76, 0.3), 0.035), 0.05);
+            builder.lock(&stand, 4, 0.02);
+            let outwards = vec3(0.22, 0.42, 0.88).normalize();
+            let down = vec3(0.5, -0.8, 0.2);
+            let down = (down - outwards * down.dot(outwards)).normalize();
+            let axes = Mat3::from_cols(down, outwards.cross(down), outwards);
+            let middle = neck_axis(-1.49) + vec3(0.55 * radius + 0.04, 0.0, 0.9 * radius + 0.2);
+            builder.add(Shape::turned_ellipsoid(middle, vec3(0.25, 0.15, 0.055), axes), 0.05);
             builder.paint(Region::Neck, Material::Trim);
             for y in [-1.74, -1.92, -2.08] {
-                let z = builder.front(0.0, y).z;
+                let z = builder.front(0.0, y + LIFT).z;
                 builder.add(Shape::ellipsoid(vec3(0.0, y, z), vec3(0.042, 0.042, 0.02)), 0.0);
             }
         }
@@ -135,16 +143,16 @@ pub(super) fn build(builder: &mut Builder, identity: &Identity, anatomy: &Anatom
             builder.paint(Region::Neck, Material::Trim).mirrored(true);
             let x = 0.5 * neck.shoulders;
             let strap = [
-                (vec3(x - 0.04, -1.95, 0.26), 0.045),
-                (vec3(x, -1.66, 0.08), 0.045),
-                (vec3(x, -1.5, -0.22), 0.045),
-                (vec3(x, -1.62, -0.52), 0.045),
-                (vec3(x - 0.04, -1.95, -0.74), 0.045),
+                (vec3(x - 0.04, -1.95, 0.17), 0.045),
+                (vec3(x, -1.66, 0.01), 0.045),
+                (vec3(x, -1.5, -0.26), 0.045),
+                (vec3(x, -1.66, -0.5), 0.045),
+                (vec3(x - 0.04, -1.95, -0.65), 0.045),
             ];
             builder.lock(&strap, 3, 0.0);
         }
     }
-    builder.cut(floor(0.0), 0.04);
+    builder.cut(floor(0.0), 0.04).offset(Vec3::ZERO);
 }
 
 fn scarf(builder: &mut Builder, radius: f32) {
@@ -159,7 +167,7 @@ fn scarf(builder: &mut Builder, radius: f32) {
 
 /// Everything below the bust's end.
 fn floor(raised: f32) -> Shape {
-    Shape::HalfSpace { normal: Vec3::Y, offset: FLOOR + 0.02 + raised }
+    Shape::HalfSpace { normal: Vec3::Y, offset: FLOOR - LIFT + 0.02 + raised }
 }
 
 /// Everything above a plane through `point` whose normal is the turned y axis.

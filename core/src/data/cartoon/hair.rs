@@ -49,7 +49,7 @@ pub(super) fn build(builder: &mut Builder, identity: &Identity, anatomy: &Anatom
         HairStyle::SidePart => barber.side_part(),
         HairStyle::Quiff => barber.quiff(),
         HairStyle::Bowl => barber.bowl(),
-        HairStyle::Curly => barber.curls(0.17, 90, -0.25),
+        HairStyle::Curly => barber.curls(0.185, 130, -0.25),
         HairStyle::Afro => barber.curls(0.27, 80, -0.5),
         HairStyle::Bun => barber.bun(),
         HairStyle::Bob => barber.bob(hair.fringe),
@@ -114,7 +114,7 @@ impl Barber<'_> {
     fn scalp_lock(&mut self, keys: &[(f32, f32, f32, f32)], blend: f32) {
         let knots: Vec<_> =
             keys.iter().map(|&(polar, azimuth, lift, radius)| (self.scalp(polar, azimuth, lift), radius)).collect();
-        self.builder.mirrored(false).lock(&knots, 3, blend);
+        self.builder.mirrored(false).lock(&knots, 2, blend);
     }
 
     /// Locks over the forehead from one temple to the other.
@@ -126,7 +126,7 @@ impl Barber<'_> {
             let end = down_to + ragged - 0.06 * (1.0 - across.abs());
             self.scalp_lock(
                 &[
-                    (0.45, 0.9 * azimuth + 0.05 * self.side, 0.07, 0.12),
+                    (0.35, 0.9 * azimuth + 0.05 * self.side, -0.06, 0.12),
                     (0.85, azimuth, 0.1, 0.115),
                     (end, 1.08 * azimuth + 0.06 * self.side, 0.04, 0.05),
                 ],
@@ -144,14 +144,14 @@ impl Barber<'_> {
             for index in 0..count {
                 let across = 2.0 * index as f32 / (count - 1) as f32 - 1.0;
                 let jitter = self.stream.range(-0.06, 0.06);
-                let start = 0.55 - 0.35 * row as f32 + jitter;
-                let azimuth = 0.62 * across + 0.4 * jitter;
+                let start = 0.82 - 0.34 * row as f32 + jitter;
+                let azimuth = (0.72 + 0.1 * row as f32) * across + 0.4 * jitter;
                 let lift = 0.12 + 0.1 * self.volume;
                 self.scalp_lock(
                     &[
-                        (start - 0.15, azimuth * 1.3, lift - 0.04, 0.1),
-                        (start + 0.15, azimuth * 1.05, lift + 0.06, 0.12),
-                        (start + 0.42, azimuth + 0.12 * self.side, lift + 0.03, 0.035),
+                        (start - 0.25, azimuth * 1.2, -0.05, 0.13),
+                        (start + 0.12, azimuth * 1.05, lift + 0.03, 0.15),
+                        (start + 0.4, azimuth + 0.12 * self.side, lift, 0.03),
                     ],
                     0.05,
                 );
@@ -173,7 +173,7 @@ impl Barber<'_> {
             let end_polar = 1.08 + 0.12 * back + self.stream.range(-0.04, 0.04);
             self.scalp_lock(
                 &[
-                    (polar, start_azimuth, 0.05, 0.09),
+                    (polar, start_azimuth, 0.0, 0.09),
                     (0.75 - 0.5 * back, side * 0.1, lift + 0.06, 0.17),
                     (0.85 - 0.2 * back, -side * (0.42 + 0.5 * back), lift + 0.04, 0.17),
                     (end_polar, end_azimuth, 0.04, 0.06),
@@ -327,7 +327,7 @@ impl Barber<'_> {
                 let polar = 0.86 - 0.55 * back;
                 self.scalp_lock(
                     &[
-                        (polar, start, 0.1, 0.07),
+                        (polar, start, 0.02, 0.08),
                         (polar + 0.12, start + side * (0.45 + 0.2 * back), 0.13, 0.13),
                         (1.12, side * (0.95 + 0.3 * back), 0.12, 0.12),
                         (1.75, side * (1.18 + 0.3 * back), 0.12, 0.05),
@@ -374,10 +374,10 @@ impl Barber<'_> {
                                 + share * (reach * cos * 0.75 - 0.12 + 0.2 * (1.0 - back))
                                 + 0.7 * waving,
                         );
-                        (point, (0.17 + 0.03 * self.volume) * (1.0 - 0.78 * share.powi(3)))
+                        (point, (0.2 + 0.03 * self.volume) * (1.0 - 0.8 * share.powi(3)))
                     })
                     .collect();
-                self.builder.mirrored(false).lock(&knots, 3, 0.06);
+                self.builder.mirrored(false).lock(&knots, 2, 0.1);
             }
         }
     }
@@ -399,7 +399,7 @@ impl Barber<'_> {
             (seat + vec3(0.22 * side, -0.85 * length, -0.38), 0.22),
             (end, 0.03),
         ];
-        self.builder.mirrored(false).lock(&knots, 4, 0.05);
+        self.builder.mirrored(false).lock(&knots, 3, 0.05);
         self.tie(seat + 0.08 * out, out, 0.15);
     }
 
@@ -424,7 +424,7 @@ impl Barber<'_> {
                 (seat + vec3(0.3 * side, -0.85 * drop, 0.05), 0.17),
                 (seat + vec3(0.22 * side, -1.1 * drop, 0.08), 0.03),
             ];
-            self.builder.mirrored(false).lock(&knots, 4, 0.05);
+            self.builder.mirrored(false).lock(&knots, 3, 0.05);
             self.tie(seat + 0.06 * out, out, 0.14);
         }
     }
@@ -435,19 +435,20 @@ impl Barber<'_> {
         self.free_face(0.98);
         self.free_neck(0.1);
         self.finish_top(false);
-        let knots = 8 + (3.0 * self.length) as usize;
+        let knots = 11 + (3.0 * self.length) as usize;
         for side in [1.0f32, -1.0] {
             let top = self.scalp(1.75, side * 1.75, 0.02);
             let end = vec3(side * 0.8, -1.5 - 0.12 * self.length, 0.16);
             let at = |share: f32| top.lerp(end, share) + vec3(side * 0.16 * (PI * share).sin(), 0.0, 0.08 * share);
-            self.builder.mirrored(false);
+            let core = [(top, 0.09), (at(0.5), 0.08), (at(1.0), 0.06)];
+            self.builder.mirrored(false).lock(&core, 3, 0.03);
             for index in 0..knots {
                 let share = index as f32 / (knots - 1) as f32;
                 let zigzag = if index % 2 == 0 { 1.0 } else { -1.0 };
                 let turn = Mat3::from_rotation_z(0.65 * zigzag);
                 let along = turn * Vec3::Y;
                 self.builder.flow(Flow::Along { origin: at(share), axis: along });
-                let radii = vec3(0.1, 0.17, 0.125) * (1.05 - 0.25 * share);
+                let radii = vec3(0.1, 0.165, 0.125) * (1.05 - 0.25 * share);
                 let centre = at(share) + vec3(0.045 * zigzag, 0.0, 0.0);
                 self.builder.add(Shape::turned_ellipsoid(centre, radii, turn), 0.02);
             }
@@ -480,7 +481,7 @@ impl Barber<'_> {
     fn spiky(&mut self) {
         self.meridians(vec3(0.0, 1.0, -0.3));
         self.short_cap(0.1);
-        let count = 46;
+        let count = 30;
         for index in 0..count {
             let height = 1.0 - 1.35 * (index as f32 + 0.5) / count as f32;
             let ring = (1.0 - height * height).max(0.0).sqrt();
@@ -492,15 +493,16 @@ impl Barber<'_> {
             if face < 1.0 || low {
                 continue;
             }
-            let reach = (0.24 + 0.2 * self.volume) * self.stream.range(0.8, 1.15);
-            let sweep = vec3(0.12 * self.side, 0.32, 0.18) + 0.18 * direction.z * Vec3::Z;
+            let reach = (0.34 + 0.2 * self.volume) * self.stream.range(0.8, 1.15);
+            // Up and forward in front, down and back behind.
+            let sweep = vec3(0.12 * self.side, 0.1 + 0.5 * direction.z, 0.1 + 0.3 * direction.z);
             let tip_direction = (direction + sweep + 0.1 * self.stream.range(-1.0, 1.0) * Vec3::X).normalize();
             let knots = [
-                (root + 0.03 * direction, 0.16),
-                (root + 0.45 * reach * (direction + 0.3 * tip_direction), 0.11),
-                (root + 0.3 * reach * direction + reach * tip_direction, 0.018),
+                (root, 0.25),
+                (root + 0.45 * reach * (direction + 0.3 * tip_direction), 0.17),
+                (root + 0.3 * reach * direction + reach * tip_direction, 0.02),
             ];
-            self.builder.mirrored(false).lock(&knots, 2, 0.05);
+            self.builder.mirrored(false).lock(&knots, 2, 0.08);
         }
     }
 

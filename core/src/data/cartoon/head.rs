@@ -1,7 +1,5 @@
 //! The head's solids: skull, face, nose, ears, eyes with lids and lashes, eyebrows, mouth.
 
-use std::f32::consts::FRAC_PI_2;
-
 use glam::{Mat3, Vec3, vec3};
 
 use super::{
@@ -69,8 +67,8 @@ pub(super) fn build(builder: &mut Builder, identity: &Identity) -> Anatomy {
 
     let eyes = place_eyes(builder, identity);
     for eye in eyes {
-        let socket = eye.centre + eye.axes * vec3(0.0, 0.02, 0.62 * eye.radius);
-        let radii = eye.radius * vec3(1.25, 0.95, 0.6);
+        let socket = eye.centre + eye.axes * vec3(0.0, -0.03, 0.66 * eye.radius);
+        let radii = eye.radius * vec3(1.1, 0.75, 0.4);
         builder.mirrored(false).cut(Shape::turned_ellipsoid(socket, radii, eye.axes), 0.22);
     }
     for eye in &eyes {
@@ -128,14 +126,17 @@ fn nose(builder: &mut Builder, identity: &Identity, root: Vec3, tip: Vec3) {
 fn ears(builder: &mut Builder, identity: &Identity, skull_radii: Vec3) {
     let ears = &identity.ears;
     let height = identity.eyes.height + ears.height - 0.04;
-    let (sin, cos) = ears.angle_rad.sin_cos();
+    // Hair that falls over the ears holds them against the head.
+    let covered = identity.hair.style.covers_ears();
+    let angle_rad = if covered { ears.angle_rad.min(0.12) } else { ears.angle_rad };
+    let (sin, cos) = angle_rad.sin_cos();
     // The ear's plate leans back and opens to the front.
     let normal = vec3(cos, 0.0, sin);
     let lean = vec3(0.06, 1.0, -0.14).normalize();
     let forward = lean.cross(normal).normalize();
     let axes = Mat3::from_cols(lean.cross(forward).normalize(), lean, forward);
     let side = skull_radii.x * (1.0 - ((height - 0.25) / skull_radii.y).powi(2)).max(0.1).sqrt();
-    let centre = vec3(side + 0.05 + 0.3 * ears.size * ears.angle_rad.sin(), height, -0.1);
+    let centre = vec3(side + 0.05 + 0.3 * ears.size * sin, height, -0.1);
     let at = |x: f32, y: f32, z: f32| centre + axes * (ears.size * vec3(x, y, z));
     builder.paint(Region::Ears, Material::Skin).mirrored(true);
     builder.add(Shape::turned_ellipsoid(centre, ears.size * vec3(0.27, 0.98, 0.66), axes), 0.1);
@@ -148,7 +149,7 @@ fn ears(builder: &mut Builder, identity: &Identity, skull_radii: Vec3) {
     let outwards = axes.x_axis.x.signum();
     builder.cut(Shape::turned_ellipsoid(at(0.36 * outwards, 0.12, 0.1), ears.size * vec3(0.3, 0.62, 0.38), axes), 0.05);
     builder.add(Shape::sphere(at(0.12 * outwards, -0.08, 0.5), 0.16 * ears.size), 0.06);
-    if ears.studs {
+    if ears.studs && !covered {
         builder.paint(Region::Ears, Material::Metal);
         builder.add(Shape::sphere(at(0.3 * outwards, -0.84, 0.1), 0.045), 0.0);
     }
@@ -229,8 +230,9 @@ fn lids(builder: &mut Builder, identity: &Identity, eye: &Eye) {
     let [up, forward] = [eye.axes.y_axis, eye.axes.z_axis];
     let hinge = |angle: f32| (up * angle.cos() - forward * angle.sin()).normalize();
     let radius = eye.radius + LID_THICKNESS;
-    for normal in [hinge(identity.eyes.upper_lid_rad), -hinge(-identity.eyes.lower_lid_rad)] {
-        builder.add(Shape::Lid { centre: eye.centre, radius, normal }, 0.08);
+    let (upper, lower) = (hinge(identity.eyes.upper_lid_rad), -hinge(-identity.eyes.lower_lid_rad));
+    for (normal, blend) in [(upper, 0.08), (lower, 0.13)] {
+        builder.add(Shape::Lid { centre: eye.centre, radius, normal }, blend);
     }
 }
 
@@ -274,13 +276,14 @@ fn eyebrows(builder: &mut Builder, identity: &Identity, eyes: &[Eye; 2]) {
     for eye in eyes {
         let side = eye.centre.x.signum();
         let raise = if side > 0.0 { brows.raise } else { 0.0 };
-        let middle_y = eye.centre.y + 0.8 * eye.radius + brows.height + raise;
+        let middle_y = eye.centre.y + 0.85 * eye.radius + brows.height + raise;
         let knots = (0..6)
             .map(|step| {
                 let share = step as f32 / 5.0;
                 let along = 2.0 * share - 1.0;
                 let x = eye.centre.x.abs() + 0.02 + brows.length * along;
-                let y = middle_y + brows.arch * (FRAC_PI_2 * (along - 0.15)).cos() - 0.5 * brows.arch
+                let y = middle_y
+                    + brows.arch * (0.6 - (along - 0.1).powi(2) * if along < 0.1 { 0.5 } else { 1.0 })
                     + brows.length * along * brows.tilt_rad.sin();
                 let radius = brows.thickness * (1.0 - 0.55 * share.powi(2)) * if step == 0 { 0.8 } else { 1.0 };
                 (vec3(side * x.max(0.05), y, 0.0), radius)

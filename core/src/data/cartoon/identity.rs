@@ -235,6 +235,11 @@ impl HairStyle {
         Self::Spiky,
         Self::Beanie,
     ];
+
+    /// Whether the hair falls over the ears.
+    pub const fn covers_ears(self) -> bool {
+        matches!(self, Self::Bob | Self::Long | Self::Wavy)
+    }
 }
 
 /// Hair.
@@ -400,7 +405,7 @@ impl Face {
             head_height: around(stream, 1.0, 0.07),
             head_depth: around(stream, 1.0, 0.06),
             jaw_width: around(stream, 1.0, 0.14),
-            face_length: around(stream, 1.0, 0.1),
+            face_length: around(stream, 1.0, 0.08),
             chin_size: around(stream, 1.0, 0.3),
             chin_forward: around(stream, 0.0, 0.06),
             cheek_size: around(stream, 1.0, 0.2),
@@ -437,8 +442,8 @@ impl Eyebrows {
             thickness: around(stream, 0.05 - 0.016 * complexion.persona, 0.016),
             length: around(stream, 0.23, 0.045),
             arch: around(stream, 0.09, 0.05),
-            tilt_rad: around(stream, -0.1, 0.24),
-            height: around(stream, 0.16, 0.05),
+            tilt_rad: around(stream, -0.14, 0.2),
+            height: around(stream, 0.2, 0.05),
             raise: if stream.chance(0.25) { stream.range(-0.08, 0.08) } else { 0.0 },
         }
     }
@@ -446,13 +451,13 @@ impl Eyebrows {
 
 impl Mouth {
     fn draw(stream: &mut Stream, complexion: &palette::Complexion) -> Self {
-        let laughing = stream.chance(0.5);
+        let laughing = stream.chance(0.55);
         let made_up = stream.chance(0.7 * complexion.persona);
         let (lip_colour, tint) = if made_up { palette::lipstick(stream) } else { ([0.85, 0.36, 0.36], 0.0) };
         Self {
-            width: around(stream, if laughing { 0.33 } else { 0.27 }, 0.07),
+            width: around(stream, if laughing { 0.36 } else { 0.29 }, 0.06),
             place: around(stream, 0.43, 0.06),
-            smile: if laughing { around(stream, 0.1, 0.05) } else { around(stream, 0.05, 0.07) },
+            smile: if laughing { around(stream, 0.13, 0.05) } else { around(stream, 0.08, 0.07) },
             open: if laughing {
                 around(stream, 0.17, 0.09)
             } else if stream.chance(0.2) {
@@ -462,7 +467,7 @@ impl Mouth {
             },
             fullness: around(stream, 0.85 + 0.25 * complexion.persona, 0.35),
             lip_colour,
-            tint: if made_up { tint } else { stream.range(0.3, 0.55) },
+            tint: if made_up { tint } else { stream.range(0.1, 0.35) },
         }
     }
 }

@@ -220,11 +220,11 @@ impl Portrait {
         let point = origin + along * direction;
         // Differences over half a pixel smooth what a pixel cannot show.
         let step = (0.35 * footprint).clamp(0.0015, 0.01);
-        let slope = gradient(point, step, |point| self.scene.distance(point));
+        let (slope, distance) = gradient(point, step, |point| self.scene.distance(point));
         let normal = slope.normalize_or(-direction);
         // What is left to the surface, taken along the ray where it does not graze.
         let towards = -normal.dot(direction);
-        let rest = self.scene.distance(point) / slope.length().max(0.3);
+        let rest = distance / slope.length().max(0.3);
         let along = along + if towards > 0.25 { (rest / towards).clamp(-0.01, 0.01) } else { 0.0 };
         let point = origin + along * direction;
         let part = self.scene.part_at(point)?;

@@ -133,6 +133,7 @@ pub(super) struct Builder {
     material: Option<Material>,
     flow: Option<Flow>,
     mirrored: bool,
+    offset: Vec3,
 }
 
 impl Builder {
@@ -161,6 +162,12 @@ impl Builder {
         self
     }
 
+    /// Moves the parts that follow.
+    pub fn offset(&mut self, offset: Vec3) -> &mut Self {
+        self.offset = offset;
+        self
+    }
+
     /// Joins a solid.
     pub fn add(&mut self, shape: Shape, blend: f32) -> &mut Self {
         self.push(shape, blend, Operation::Add)
@@ -176,9 +183,10 @@ impl Builder {
         self.push(shape, blend, Operation::Hollow)
     }
 
-    /// Joins a tapered tube along a smooth curve through `knots` (point, radius), `segments` pieces a knot.
-    pub fn lock(&mut self, knots: &[(Vec3, f32)], segments: usize, blend: f32) -> &mut Self {
-        self.add(Shape::Lock(Lock::new(&spline(knots, segments))), blend)
+    /// Joins a tapered tube along a smooth curve through `knots` (point, radius); the closest point is searched from
+    /// `pieces` places a knot.
+    pub fn lock(&mut self, knots: &[(Vec3, f32)], pieces: usize, blend: f32) -> &mut Self {
+        self.add(Shape::Lock(Lock::new(knots, pieces)), blend)
     }
 
     /// A copy of a finished or current group, to place parts against.
@@ -208,7 +216,7 @@ impl Builder {
 
     fn push(&mut self, shape: Shape, blend: f32, operation: Operation) -> &mut Self {
         self.parts.push(Part {
-            shape,
+            shape: shape.moved(self.offset),
             operation,
             blend,
             mirrored: self.mirrored,
@@ -227,32 +235,6 @@ impl Builder {
     }
 }
 
-/// Points of a Catmull-Rom curve through the knots, radii interpolated along.
-fn spline(knots: &[(Vec3, f32)], segments: usize) -> Vec<(Vec3, f32)> {
-    let at = |index: isize| knots[index.clamp(0, knots.len() as isize - 1) as usize];
-    let mut path = Vec::with_capacity(knots.len() * segments + 1);
-    for index in 0..knots.len().saturating_sub(1) as isize {
-        let [before, start, end, after] = [at(index - 1), at(index), at(index + 1), at(index + 2)];
-        for step in 0..segments {
-            let t = step as f32 / segments as f32;
-            let blend = |before: f32, start: f32, end: f32, after: f32| {
-                0.5 * (2.0 * start
-                    + (end - before) * t
-                    + (2.0 * before - 5.0 * start + 4.0 * end - after) * t * t
-                    + (3.0 * (start - end) + after - before) * t * t * t)
-            };
-            let point = Vec3::new(
-                blend(before.0.x, start.0.x, end.0.x, after.0.x),
-                blend(before.0.y, start.0.y, end.0.y, after.0.y),
-                blend(before.0.z, start.0.z, end.0.z, after.0.z),
-            );
-            path.push((point, blend(before.1, start.1, end.1, after.1).max(0.004)));
-        }
-    }
-    path.extend(knots.last().copied());
-    path
-}
-
 #[inline]
 fn combine(distance: f32, part_distance: f32, part: &Part) -> f32 {
     match part.operation {
@@ -261,12 +243,19 @@ fn combine(distance: f32, part_distance: f32, part: &Part) -> f32 {
     }
 }
 
-/// Gradient by four differences at the corners of a tetrahedron with half edge `step`.
+/// Gradient by four differences at the corners of a tetrahedron with half edge `step`, and the mean of the four values:
+/// the distance in the middle, to second order.
 #[inline]
-pub(super) fn gradient(point: Vec3, step: f32, distance: impl Fn(Vec3) -> f32) -> Vec3 {
+pub(super) fn gradient(point: Vec3, step: f32, distance: impl Fn(Vec3) -> f32) -> (Vec3, f32) {
     const CORNERS: [Vec3; 4] =
         [Vec3::new(1.0, -1.0, -1.0), Vec3::new(-1.0, -1.0, 1.0), Vec3::new(-1.0, 1.0, -1.0), Vec3::new(1.0, 1.0, 1.0)];
-    CORNERS.into_iter().map(|corner| corner * distance(point + step * corner)).sum::<Vec3>() / (4.0 * step)
+    let (mut slope, mut sum) = (Vec3::ZERO, 0.0);
+    for corner in CORNERS {
+        let value = distance(point + step * corner);
+        slope += value * corner;
+        sum += value;
+    }
+    (slope / (4.0 * step), 0.25 * sum)
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -505,13 +494,14 @@ impl Scene {
     /// Share of a soft light seen from `point` in unit direction `direction`, 0 in full shadow.
     /// `sharpness` is one over the light's angular radius.
     pub fn visibility(&self, point: Vec3, direction: Vec3, sharpness: f32) -> f32 {
+        const EXACT_ALONG: f32 = 0.13;
         let mut share = 1.0f32;
-        let mut along = 0.03;
+        let mut along = 0.05;
         for _ in 0..40 {
             let ahead = point + along * direction;
             // Small features throw their shadow close by; farther away the grid is fine enough.
-            let distance = if along < 0.22 { self.distance(ahead) } else { self.soft_distance(ahead) };
-            if distance < 0.9 * EXACT_WITHIN || along >= 0.22 {
+            let distance = if along < EXACT_ALONG { self.distance(ahead) } else { self.soft_distance(ahead) + 0.015 };
+            if distance < 0.9 * EXACT_WITHIN || along >= EXACT_ALONG {
                 share = share.min(sharpness * distance / along);
             }
             if share < 0.01 {

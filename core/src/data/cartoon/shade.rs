@@ -80,7 +80,7 @@ impl Studio {
     /// Prepares an identity's colours.
     pub fn new(identity: &Identity, anatomy: Anatomy) -> Self {
         let skin = linear(identity.face.skin);
-        let natural = skin * vec3(0.86, 0.5, 0.5);
+        let natural = skin * vec3(0.94, 0.58, 0.56);
         let lips = natural.lerp(linear(identity.mouth.lip_colour), identity.mouth.tint.clamp(0.0, 1.0));
         Self {
             skin,
@@ -106,10 +106,10 @@ impl Studio {
     /// same surface.
     pub fn exposure(scene: &Scene, surface: &Surface) -> Exposure {
         let facing = surface.normal.dot(key_direction());
-        let lifted = surface.point + 0.02 * surface.normal;
+        let lifted = surface.point + 0.035 * surface.normal;
         Exposure {
             occlusion: ambient_occlusion(scene, surface.point, surface.normal),
-            key: if facing > -0.35 { scene.visibility(lifted, key_direction(), 7.0) } else { 0.0 },
+            key: if facing > -0.35 { scene.visibility(lifted, key_direction(), 5.5) } else { 0.0 },
         }
     }
 
@@ -119,7 +119,11 @@ impl Studio {
         let look = self.look(part, surface);
         let normal = look.normal;
         let key = key_direction();
-        let Exposure { occlusion, key: visible } = exposure;
+        let Exposure { mut occlusion, key: mut visible } = exposure;
+        if part.material == Material::Teeth {
+            // Light that bounces about in the mouth keeps teeth white.
+            (occlusion, visible) = (occlusion.max(0.75), visible.max(0.6));
+        }
         let facing = surface.normal.dot(key);
 
         // Light wraps farthest in the channel that skin scatters most; shadows keep some of it.
@@ -128,7 +132,7 @@ impl Studio {
             ((Vec3::splat(cosine) + look.wrap) / (Vec3::ONE + look.wrap)).max(Vec3::ZERO)
         };
         let shadow = Vec3::splat(visible).powf_each(Vec3::ONE - 0.9 * look.wrap);
-        let occluded = Vec3::splat(occlusion).powf_each(Vec3::ONE - 0.6 * look.wrap);
+        let occluded = Vec3::splat(occlusion).powf_each(Vec3::ONE - 1.1 * look.wrap);
         let key_light = vec3(2.05, 1.93, 1.76) * wrapped(key) * shadow;
         let fill = vec3(0.34, 0.37, 0.44) * wrapped(vec3(0.75, 0.15, 0.65).normalize());
         let sky = vec3(0.62, 0.68, 0.78) * (0.5 + 0.5 * normal.y);
@@ -233,12 +237,12 @@ impl Studio {
         let anatomy = &self.anatomy;
         let beside = vec3(point.x.abs(), point.y, point.z);
         let near = |centre: Vec3, radius: f32, at: Vec3| (-(at - centre).length_squared() / (radius * radius)).exp();
-        let cheek_centre = anatomy.cheek + vec3(0.12, -0.06, 0.24);
-        let cheek = near(cheek_centre, 0.24, beside);
+        let cheek_centre = anatomy.cheek + vec3(0.16, -0.1, 0.2);
+        let cheek = near(cheek_centre, 0.21, beside);
         let nose = near(anatomy.nose_tip, 0.16, point);
         let ear = smooth_step(0.86, 1.1, beside.x) * smooth_step(-0.6, -0.4, point.y);
-        let flush = (self.blush * (0.7 * cheek + 0.3 * nose) + 0.3 * ear).min(1.0);
-        let mut albedo = self.skin.lerp(self.skin * vec3(1.03, 0.55, 0.53), flush);
+        let flush = (self.blush * (0.8 * cheek + 0.3 * nose) + 0.3 * ear).min(1.0);
+        let mut albedo = self.skin.lerp(self.skin * vec3(1.12, 0.68, 0.66), flush);
         if self.freckles > 0.0 {
             let where_freckles = near(cheek_centre + vec3(-0.08, 0.05, 0.0), 0.28, beside)
                 .max(0.9 * near(anatomy.nose_tip + vec3(0.0, 0.12, 0.0), 0.22, point));
@@ -340,7 +344,7 @@ impl Studio {
             albedo: colour * (1.0 + 0.75 * here),
             normal,
             wrap: Vec3::splat(0.2),
-            gloss: (0.34, 26.0),
+            gloss: (0.24, 24.0),
             strand: Some((direction + 0.25 * here * surface.normal).normalize_or(direction)),
             sheen: 0.4,
         }
@@ -393,11 +397,11 @@ fn ambient_occlusion(scene: &Scene, point: Vec3, normal: Vec3) -> f32 {
     let mut weight = 1.0;
     for (step, height) in [0.035, 0.09, 0.18, 0.32].into_iter().enumerate() {
         let above = point + height * normal;
-        let distance = if step < 2 { scene.distance(above) } else { scene.soft_distance(above) }.min(height);
+        let distance = if step < 1 { scene.distance(above) } else { scene.soft_distance(above) }.min(height);
         blocked += weight * (height - distance) / height;
         weight *= 0.72;
     }
-    let open = 1.0 - 0.36 * blocked;
+    let open = 1.0 - 0.33 * blocked;
     open.clamp(0.12, 1.0)
 }
 

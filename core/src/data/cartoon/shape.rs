@@ -1,7 +1,7 @@
 //! Signed distance primitives, in head units: negative inside, never steeper than 1, so that a sphere trace may
 //! step by the value.
 
-use glam::{Mat3, Vec3};
+use glam::{Mat3, Vec3, Vec4};
 
 /// A solid.
 #[derive(Clone, Debug)]
@@ -80,23 +80,27 @@ pub(super) struct RoundCone {
     slant_squared: f32,
 }
 
-/// A tube along a polyline fine enough to look like a curve, each node with its radius.
+/// A tapered tube along a Catmull-Rom curve.
+///
+/// The closest point of a polyline is the first guess of the closest point of the curve; a Gauss-Newton step makes the
+/// distance as smooth as the curve.
 #[derive(Clone, Debug)]
 pub(super) struct Lock {
+    /// Cubics between the knots: point and radius.
+    spans: Vec<[Vec4; 4]>,
     nodes: Vec<LockNode>,
 }
 
+/// A node of a lock's polyline.
 #[derive(Clone, Copy, Debug)]
 struct LockNode {
     point: Vec3,
-    radius: f32,
     /// To the next node.
     step: Vec3,
-    radius_step: f32,
     inverse_length_squared: f32,
-    tangent: Vec3,
     /// Unit vector across the curve that turns as little as it can.
     across: Vec3,
+    /// Length of the curve up to here.
     arc: f32,
 }
 
@@ -187,6 +191,26 @@ impl Shape {
         })
     }
 
+    /// The same solid, elsewhere.
+    #[must_use]
+    pub fn moved(mut self, by: Vec3) -> Self {
+        match &mut self {
+            Self::Sphere { centre, .. }
+            | Self::Ellipsoid { centre, .. }
+            | Self::Torus { centre, .. }
+            | Self::RoundBox { centre, .. }
+            | Self::Lid { centre, .. } => *centre += by,
+            Self::RoundCone(cone) => cone.start += by,
+            Self::Lock(lock) => {
+                lock.nodes.iter_mut().for_each(|node| node.point += by);
+                lock.spans.iter_mut().for_each(|span| span[0] += by.extend(0.0));
+            }
+            Self::HalfSpace { normal, offset } => *offset += normal.dot(by),
+            Self::MouthBand(band) => band.frame.centre += by,
+        }
+        self
+    }
+
     /// Distance from `point` to the surface.
     #[inline]
     pub fn distance(&self, point: Vec3) -> f32 {
@@ -239,67 +263,95 @@ impl RoundCone {
 }
 
 impl Lock {
-    /// The tube through these points with these radii.
-    pub fn new(path: &[(Vec3, f32)]) -> Self {
-        let mut nodes: Vec<LockNode> = Vec::with_capacity(path.len());
+    /// The tube through these knots (point, radius); its polyline has `pieces` nodes a knot.
+    pub fn new(knots: &[(Vec3, f32)], pieces: usize) -> Self {
+        let knot = |index: usize| knots.get(index).or(knots.last()).map_or(Vec4::ZERO, |(point, r)| point.extend(*r));
+        let spans: Vec<[Vec4; 4]> = (0..knots.len().saturating_sub(1))
+            .map(|index| {
+                let [before, start, end, after] =
+                    [knot(index.saturating_sub(1)), knot(index), knot(index + 1), knot(index + 2)];
+                [
+                    start,
+                    0.5 * (end - before),
+                    before - 2.5 * start + 2.0 * end - 0.5 * after,
+                    1.5 * (start - end) + 0.5 * (after - before),
+                ]
+            })
+            .collect();
+        let mut lock = Self { spans, nodes: Vec::new() };
+        let count = lock.spans.len() * pieces + 1;
         let mut arc = 0.0;
-        for (index, &(point, radius)) in path.iter().enumerate() {
-            let before = path.get(index.wrapping_sub(1)).map_or(point, |node| node.0);
-            let (after, after_radius) = path.get(index + 1).copied().unwrap_or((point, radius));
-            let tangent = (after - before).normalize_or(Vec3::Y);
-            let across = nodes.last().map_or_else(|| tangent.any_orthonormal_vector(), |node| node.across);
+        for index in 0..count {
+            let (here, slope) = lock.curve(index as f32 / pieces as f32);
+            let next = if index + 1 < count { lock.curve((index + 1) as f32 / pieces as f32).0 } else { here };
+            let tangent = slope.truncate().normalize_or(Vec3::Y);
+            let across = lock.nodes.last().map_or_else(|| tangent.any_orthonormal_vector(), |node| node.across);
             let across = (across - tangent * across.dot(tangent)).normalize_or(tangent.any_orthonormal_vector());
-            let step = after - point;
-            nodes.push(LockNode {
-                point,
-                radius,
+            let step = (next - here).truncate();
+            lock.nodes.push(LockNode {
+                point: here.truncate(),
                 step,
-                radius_step: after_radius - radius,
                 inverse_length_squared: step.length_squared().max(1e-9).recip(),
-                tangent,
                 across,
                 arc,
             });
             arc += step.length();
         }
-        Self { nodes }
+        lock
+    }
+
+    /// Point with radius, and its derivative, at a parameter that counts knots.
+    #[inline]
+    fn curve(&self, parameter: f32) -> (Vec4, Vec4) {
+        let index = (parameter.max(0.0) as usize).min(self.spans.len().saturating_sub(1));
+        let Some([start, first, second, third]) = self.spans.get(index) else { return (Vec4::ZERO, Vec4::Y) };
+        let t = parameter - index as f32;
+        (*start + t * (*first + t * (*second + t * *third)), *first + t * (2.0 * *second + 3.0 * t * *third))
+    }
+
+    /// Parameter of the curve's closest point, and the point of the polyline it was found from.
+    #[inline]
+    fn closest(&self, point: Vec3) -> (f32, usize, f32) {
+        let mut best = (f32::MAX, 0, 0.0);
+        for (index, node) in self.nodes.iter().enumerate() {
+            let from = point - node.point;
+            let share = (from.dot(node.step) * node.inverse_length_squared).clamp(0.0, 1.0);
+            let distance = (from - share * node.step).length_squared();
+            if distance < best.0 {
+                best = (distance, index, share);
+            }
+        }
+        let (_, index, share) = best;
+        let last = self.spans.len() as f32;
+        let pieces = (self.nodes.len().saturating_sub(1)) as f32 / last.max(1.0);
+        let mut parameter = ((index as f32 + share) / pieces.max(1.0)).min(last);
+        let (here, slope) = self.curve(parameter);
+        let slope = slope.truncate();
+        let step = (point - here.truncate()).dot(slope) / slope.length_squared().max(1e-9);
+        parameter = (parameter + step.clamp(-0.5, 0.5)).clamp(0.0, last);
+        (parameter, index, share)
     }
 
     /// Distance to the tube. Where it tapers the radius counts across the curve instead of across the slanted surface,
     /// which 0.93 makes safe for slopes of up to 0.4.
     #[inline]
     fn distance(&self, point: Vec3) -> f32 {
-        let mut closest = 1e3f32;
-        for node in &self.nodes {
-            let from = point - node.point;
-            let share = (from.dot(node.step) * node.inverse_length_squared).clamp(0.0, 1.0);
-            let distance = (from - share * node.step).length() - node.radius - share * node.radius_step;
-            closest = closest.min(distance);
-        }
-        0.93 * closest
+        let (here, _) = self.curve(self.closest(point).0);
+        0.93 * ((point - here.truncate()).length() - here.w.max(0.004))
     }
 
     /// Where the curve is closest to `point`.
     pub fn place(&self, point: Vec3) -> LockPlace {
-        let mut best = (f32::MAX, 0, 0.0);
-        for (index, node) in self.nodes.iter().enumerate() {
-            let from = point - node.point;
-            let share = (from.dot(node.step) * node.inverse_length_squared).clamp(0.0, 1.0);
-            let distance = (from - share * node.step).length() - node.radius - share * node.radius_step;
-            if distance < best.0 {
-                best = (distance, index, share);
-            }
-        }
-        let (_, index, share) = best;
-        let Some(node) = self.nodes.get(index) else {
-            return LockPlace { tangent: Vec3::Y, angle_rad: 0.0, arc: 0.0 };
-        };
-        let next = self.nodes.get(index + 1).unwrap_or(node);
-        let tangent = node.tangent.lerp(next.tangent, share).normalize_or(node.tangent);
-        let across = node.across.lerp(next.across, share);
-        let from = point - node.point - share * node.step;
+        let (parameter, index, share) = self.closest(point);
+        let (here, slope) = self.curve(parameter);
+        let tangent = slope.truncate().normalize_or(Vec3::Y);
+        let (across, arc) = self.nodes.get(index).map_or((Vec3::X, 0.0), |node| {
+            let next = self.nodes.get(index + 1).unwrap_or(node);
+            (node.across.lerp(next.across, share), node.arc + share * node.step.length())
+        });
+        let from = point - here.truncate();
         let angle_rad = from.dot(across).atan2(from.dot(tangent.cross(across)));
-        LockPlace { tangent, angle_rad, arc: node.arc + share * node.step.length() }
+        LockPlace { tangent, angle_rad, arc }
     }
 }
 
