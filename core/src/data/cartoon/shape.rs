@@ -82,7 +82,7 @@ pub(super) struct RoundCone {
 
 /// A tapered tube along a Catmull-Rom curve.
 ///
-/// The closest point of a polyline is the first guess of the closest point of the curve; a Gauss-Newton step makes the
+/// The closest point of a polyline is the first guess of the closest point of the curve; a Newton step makes the
 /// distance as smooth as the curve.
 #[derive(Clone, Debug)]
 pub(super) struct Lock {
@@ -282,8 +282,8 @@ impl Lock {
         let count = lock.spans.len() * pieces + 1;
         let mut arc = 0.0;
         for index in 0..count {
-            let (here, slope) = lock.curve(index as f32 / pieces as f32);
-            let next = if index + 1 < count { lock.curve((index + 1) as f32 / pieces as f32).0 } else { here };
+            let [here, slope, _] = lock.curve(index as f32 / pieces as f32);
+            let next = if index + 1 < count { lock.curve((index + 1) as f32 / pieces as f32)[0] } else { here };
             let tangent = slope.truncate().normalize_or(Vec3::Y);
             let across = lock.nodes.last().map_or_else(|| tangent.any_orthonormal_vector(), |node| node.across);
             let across = (across - tangent * across.dot(tangent)).normalize_or(tangent.any_orthonormal_vector());
@@ -300,18 +300,24 @@ impl Lock {
         lock
     }
 
-    /// Point with radius, and its derivative, at a parameter that counts knots.
+    /// Point with radius, and its first two derivatives, at a parameter that counts knots.
     #[inline]
-    fn curve(&self, parameter: f32) -> (Vec4, Vec4) {
+    fn curve(&self, parameter: f32) -> [Vec4; 3] {
         let index = (parameter.max(0.0) as usize).min(self.spans.len().saturating_sub(1));
-        let Some([start, first, second, third]) = self.spans.get(index) else { return (Vec4::ZERO, Vec4::Y) };
+        let Some([start, first, second, third]) = self.spans.get(index) else {
+            return [Vec4::ZERO, Vec4::Y, Vec4::ZERO];
+        };
         let t = parameter - index as f32;
-        (*start + t * (*first + t * (*second + t * *third)), *first + t * (2.0 * *second + 3.0 * t * *third))
+        [
+            *start + t * (*first + t * (*second + t * *third)),
+            *first + t * (2.0 * *second + 3.0 * t * *third),
+            2.0 * *second + 6.0 * t * *third,
+        ]
     }
 
-    /// Parameter of the curve's closest point, and the point of the polyline it was found from.
+    /// Parameter of the curve's closest point, the distance there, and the place on the polyline it was found from.
     #[inline]
-    fn closest(&self, point: Vec3) -> (f32, usize, f32) {
+    fn closest(&self, point: Vec3) -> (f32, f32, usize, f32) {
         let mut best = (f32::MAX, 0, 0.0);
         for (index, node) in self.nodes.iter().enumerate() {
             let from = point - node.point;
@@ -324,26 +330,29 @@ impl Lock {
         let (_, index, share) = best;
         let last = self.spans.len() as f32;
         let pieces = (self.nodes.len().saturating_sub(1)) as f32 / last.max(1.0);
-        let mut parameter = ((index as f32 + share) / pieces.max(1.0)).min(last);
-        let (here, slope) = self.curve(parameter);
-        let slope = slope.truncate();
-        let step = (point - here.truncate()).dot(slope) / slope.length_squared().max(1e-9);
-        parameter = (parameter + step.clamp(-0.5, 0.5)).clamp(0.0, last);
-        (parameter, index, share)
+        let guess = ((index as f32 + share) / pieces.max(1.0)).min(last);
+        let [here, slope, bend] = self.curve(guess);
+        let (from, slope) = (point - here.truncate(), slope.truncate());
+        // Far on the hollow side of a bend the distance has no single minimum: then the step is kept short.
+        let speed = slope.length_squared().max(1e-9);
+        let step = from.dot(slope) / (speed - from.dot(bend.truncate())).max(0.5 * speed);
+        let parameter = (guess + step.clamp(-0.5, 0.5)).clamp(0.0, last);
+        let [there, ..] = self.curve(parameter);
+        let surface = |here: Vec4| (point - here.truncate()).length() - here.w.max(0.004);
+        (parameter, surface(here).min(surface(there)), index, share)
     }
 
     /// Distance to the tube. Where it tapers the radius counts across the curve instead of across the slanted surface,
     /// which 0.93 makes safe for slopes of up to 0.4.
     #[inline]
     fn distance(&self, point: Vec3) -> f32 {
-        let (here, _) = self.curve(self.closest(point).0);
-        0.93 * ((point - here.truncate()).length() - here.w.max(0.004))
+        0.93 * self.closest(point).1
     }
 
     /// Where the curve is closest to `point`.
     pub fn place(&self, point: Vec3) -> LockPlace {
-        let (parameter, index, share) = self.closest(point);
-        let (here, slope) = self.curve(parameter);
+        let (parameter, _, index, share) = self.closest(point);
+        let [here, slope, _] = self.curve(parameter);
         let tangent = slope.truncate().normalize_or(Vec3::Y);
         let (across, arc) = self.nodes.get(index).map_or((Vec3::X, 0.0), |node| {
             let next = self.nodes.get(index + 1).unwrap_or(node);
