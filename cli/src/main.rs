@@ -18,6 +18,10 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
     let arguments = commands::Arguments::parse();
+    if let Some(threads) = arguments.global.threads {
+        // SAFETY: no other thread runs yet. candle's matrix products read their thread count here and nowhere else.
+        unsafe { std::env::set_var("RAYON_NUM_THREADS", threads.to_string()) };
+    }
     let console = console::Console::new(&arguments.global);
     match commands::run(arguments, &console) {
         Ok(outcome) => outcome.into(),

@@ -45,7 +45,12 @@ impl ModelOptions {
     /// The model asked for, or `default`.
     pub fn load_or(&self, default: &str) -> anyhow::Result<Generator> {
         let name = self.model.as_deref().unwrap_or(default);
-        Ok(Generator::open(name, &self.device()?)?)
+        let (path, device) = (Path::new(name), self.device()?);
+        match cnerf_models::bytes(name) {
+            Some(bytes) => Ok(Generator::from_bytes(path, bytes, &device)?),
+            None if path.exists() => Ok(Generator::open(path, &device)?),
+            None => bail!("{name}: no such file, and no built-in model ({})", cnerf_models::NAMES.join(", ")),
+        }
     }
 
     /// The device asked for.

@@ -1,6 +1,5 @@
 //! The generator, its discriminators, and the files they live in.
 
-pub mod built_in;
 pub mod discriminator;
 pub mod field;
 pub mod file;

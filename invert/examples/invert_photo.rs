@@ -23,7 +23,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         Some("best") => Effort::Best,
         _ => Effort::Balanced,
     };
-    let generator = Generator::open(model, &Device::Cpu)?;
+    let generator = Generator::open(model.as_ref(), &Device::Cpu)?;
     let perceptual = rest.get(1).map(|file| Perceptual::load(file, &Device::Cpu)).transpose()?;
     let size = generator.output_resolution() as u32;
     let subject = Subject::read(Path::new(photo), &PhotoOptions::default(), None, size)?;

@@ -6,7 +6,7 @@ use anyhow::bail;
 use clap::Args;
 use cnerf_core::{
     data::dataset::Dataset,
-    model::{built_in, file, generator::Generator},
+    model::{file, generator::Generator},
 };
 use cnerf_invert::portrait::Portrait;
 use serde_json::{Value, json};
@@ -31,11 +31,11 @@ impl InfoArguments {
 
 fn describe(path: &Path) -> anyhow::Result<Value> {
     let name = path.to_string_lossy();
-    if let Some(bytes) = built_in::bytes(&name) {
+    if let Some(bytes) = cnerf_models::bytes(&name) {
         return model(path, bytes);
     }
     if !path.exists() {
-        bail!("{}: no such file; built-in models are {}", path.display(), built_in::NAMES.join(" and "));
+        bail!("{}: no such file; built-in models are {}", path.display(), cnerf_models::NAMES.join(" and "));
     }
     let extension = path.extension().map(|extension| extension.to_string_lossy().to_ascii_lowercase());
     match extension.as_deref() {

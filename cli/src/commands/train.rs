@@ -1,7 +1,7 @@
 //! `cnerf train`: listens to a trainer and draws its progress.
 
 use std::{
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -94,7 +94,7 @@ impl TrainArguments {
         }
         let device = self.model.device()?;
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &device)).transpose()?;
-        let start = self.model.model.as_ref().map(|name| Start::open(name, &device)).transpose()?;
+        let start = self.model.model.as_ref().map(|name| self.start(name, &device)).transpose()?;
         let inputs = Inputs { dataset, perceptual, start, device };
         let trainer = if self.resume {
             Trainer::resume(config, self.stage, inputs, &self.out)?
@@ -102,6 +102,14 @@ impl TrainArguments {
             Trainer::new(config, self.stage, inputs, &self.out)?
         };
         self.listen(trainer, console)
+    }
+
+    /// A run's model with its portraits' codes, or a built-in model without.
+    fn start(&self, name: &str, device: &candle_core::Device) -> anyhow::Result<Start> {
+        match cnerf_models::bytes(name) {
+            Some(_) => Ok(Start { generator: self.model.load_or(name)?, portrait_codes: None }),
+            None => Ok(Start::open(Path::new(name), device)?),
+        }
     }
 
     /// The configuration: the run's own when resuming, else the preset's; then --kimg, --batch and --set.

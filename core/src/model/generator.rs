@@ -9,7 +9,6 @@ use crate::{
     config::{Background, GeneratorConfig, UpsamplerStyle},
     error::{Error, Result},
     model::{
-        built_in,
         field::Field,
         file::{self, ModelHeader, Tensors},
         mapping::Mapping,
@@ -81,19 +80,9 @@ impl Generator {
         })
     }
 
-    /// The built-in model called `name` (`portrait` or `cartoon`), else the model file at that path.
-    pub fn open(name: &str, device: &Device) -> Result<Self> {
-        match built_in::bytes(name) {
-            Some(bytes) => Self::from_bytes(Path::new(name), bytes, device),
-            None if Path::new(name).exists() => {
-                let path = Path::new(name);
-                Self::from_bytes(path, &file::read_bytes(path)?, device)
-            }
-            None => {
-                let reason = format!("no such file, and no built-in model ({})", built_in::NAMES.join(", "));
-                Err(Error::malformed(name, reason))
-            }
-        }
+    /// The model file at `path`.
+    pub fn open(path: &Path, device: &Device) -> Result<Self> {
+        Self::from_bytes(path, &file::read_bytes(path)?, device)
     }
 
     /// The model in `bytes`; `name` stands for it in messages.

@@ -165,7 +165,7 @@ pub struct FieldStageConfig {
     pub decoupling_margin: f64,
     /// Chance that a step mixes two codes. StyleGAN: 0.9.
     pub mixing: f64,
-    /// Decay of the averaged weights a 10,000 images halve: 0.5^(batch / half_life).
+    /// Pictures after which an old value counts half in the averaged weights. Authors: 10,000.
     pub average_half_life_images: f64,
 }
 
@@ -201,10 +201,6 @@ pub struct UpsamplerStageConfig {
     pub r1_mask: f64,
     /// Steps between R1 penalties. Authors: 16.
     pub r1_steps: usize,
-    /// Weight of the path-length penalty; 0 leaves it out. StyleGAN2: 2.
-    pub path_length: f64,
-    /// Steps between path-length penalties. Authors: 4.
-    pub path_length_steps: usize,
     /// As in the field's stage.
     pub average_half_life_images: f64,
 }
@@ -281,8 +277,7 @@ impl TrainConfig {
                 perceptual: 1.0,
                 adversarial: 0.0,
                 channel_multiplier: 0.125,
-                path_length: 0.0,
-                average_half_life_images: 1_000.0,
+                    average_half_life_images: 1_000.0,
                 ..Self::paper_upsampler_stage()
             },
         }
@@ -342,8 +337,6 @@ impl TrainConfig {
             r1_image: 10.0,
             r1_mask: 1_000.0,
             r1_steps: 16,
-            path_length: 2.0,
-            path_length_steps: 4,
             average_half_life_images: 10_000.0,
         }
     }

@@ -56,12 +56,11 @@ pub struct Start {
 }
 
 impl Start {
-    /// The model called `name` (see [`Generator::open`]) and, if it is a file beside which a warm-up left the training
-    /// portraits' codes, those.
-    pub fn open(name: &str, device: &Device) -> Result<Self> {
-        let generator = Generator::open(name, device)?;
-        let path = Path::new(name).with_file_name(CODES_FILE);
-        let portrait_codes = if Path::new(name).is_file() && path.is_file() {
+    /// The model file at `path` and, if a warm-up left the training portraits' codes beside it, those.
+    pub fn open(path: &Path, device: &Device) -> Result<Self> {
+        let generator = Generator::open(path, device)?;
+        let path = path.with_file_name(CODES_FILE);
+        let portrait_codes = if path.is_file() {
             let (mut tensors, _) = file::parse_safetensors(&path, &file::read_bytes(&path)?)?;
             Some(tensors.remove(CODES).ok_or_else(|| Error::malformed(&path, "holds no portrait codes"))?.to_device(device)?)
         } else {
@@ -136,7 +135,7 @@ impl Trainer {
             if position > 0 {
                 // The stages before are done: their result lies in the run's folder.
                 let path = run.join("model.safetensors");
-                trainer.finished = Some(Start::open(&path.to_string_lossy(), &trainer.inputs.device)?);
+                trainer.finished = Some(Start::open(&path, &trainer.inputs.device)?);
             }
             let mut current = trainer.begin(position)?;
             current.stage.load(&tensors)?;

@@ -1,4 +1,4 @@
-//! The models the binary carries.
+//! The models the binary carries; what they are stands in `README.md` beside them.
 
 /// Names of the built-in models.
 pub const NAMES: [&str; 2] = ["portrait", "cartoon"];
@@ -6,8 +6,8 @@ pub const NAMES: [&str; 2] = ["portrait", "cartoon"];
 /// The file of the built-in model called `name`.
 pub fn bytes(name: &str) -> Option<&'static [u8]> {
     match name {
-        "portrait" => Some(include_bytes!("../../../models/portrait.safetensors")),
-        "cartoon" => Some(include_bytes!("../../../models/cartoon.safetensors")),
+        "portrait" => Some(include_bytes!("../portrait.safetensors")),
+        "cartoon" => Some(include_bytes!("../cartoon.safetensors")),
         _ => None,
     }
 }
