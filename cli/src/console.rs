@@ -45,7 +45,8 @@ impl Console {
         let filter = tracing_subscriber::EnvFilter::try_from_env("CNERF_LOG")
             .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(level));
         // Both fail only if set twice in a process, which `main` never does.
-        let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().try_init();
+        let _ =
+            tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().try_init();
         if let Some(threads) = options.threads {
             let _ = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads)).build_global();
         }

@@ -55,7 +55,8 @@ impl ModelOptions {
 
     /// The device asked for.
     pub fn device(&self) -> anyhow::Result<Device> {
-        let number = |text: &str| text.parse::<usize>().with_context(|| format!("--device {}: not a number", self.device));
+        let number =
+            |text: &str| text.parse::<usize>().with_context(|| format!("--device {}: not a number", self.device));
         match self.device.split_once(':') {
             None if self.device == "cpu" => Ok(Device::Cpu),
             None if self.device == "cuda" => gpu("cuda", Device::new_cuda(0)),
@@ -67,7 +68,9 @@ impl ModelOptions {
 }
 
 fn gpu(name: &str, device: candle_core::Result<Device>) -> anyhow::Result<Device> {
-    device.with_context(|| format!("--device {name}: not available; build with `--features {name}` on a machine that has it"))
+    device.with_context(|| {
+        format!("--device {name}: not available; build with `--features {name}` on a machine that has it")
+    })
 }
 
 /// Whether existing outputs may be replaced.
@@ -93,7 +96,8 @@ pub fn parse_seeds(list: &str) -> Result<Vec<u64>, String> {
     const MOST: usize = 100_000;
     let mut seeds = Vec::new();
     for part in list.split(',').map(str::trim) {
-        let number = |text: &str| text.trim().parse::<u64>().map_err(|_| format!("`{part}` is not a seed or a range of seeds"));
+        let number =
+            |text: &str| text.trim().parse::<u64>().map_err(|_| format!("`{part}` is not a seed or a range of seeds"));
         match part.split_once('-') {
             Some((first, last)) => {
                 let (first, last) = (number(first)?, number(last)?);

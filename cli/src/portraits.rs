@@ -8,22 +8,11 @@ use cnerf_invert::{inverter::Opened, portrait::Portrait};
 
 use crate::options::ModelOptions;
 
-/// A portrait, its file's model, and both joined.
-pub struct OpenPortrait {
-    /// The file's content.
-    pub portrait: Portrait,
-    /// The model as it was before tuning.
-    pub model: Generator,
-    /// The tuned generator, codes and camera.
-    pub opened: Opened,
-}
-
-/// Reads the portrait at `path` with the model it names, or with `--model`.
-pub fn open(path: &Path, options: &ModelOptions) -> anyhow::Result<OpenPortrait> {
+/// Reads the portrait at `path` with the model it names, or with `--model`, and joins them.
+pub fn open(path: &Path, options: &ModelOptions) -> anyhow::Result<Opened> {
     let portrait = Portrait::load(path)?;
     let model = model_of(&portrait, path, options)?;
-    let opened = Opened::new(&portrait, path, &model)?;
-    Ok(OpenPortrait { portrait, model, opened })
+    Ok(Opened::new(&portrait, path, &model)?)
 }
 
 /// The model a portrait was made with.

@@ -4,17 +4,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 
-/// How long to work on one photo. Times are for two laptop cores and the built-in models.
+/// How long to work on one photo.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 #[serde(rename_all = "lowercase")]
 pub enum Effort {
-    /// About fifteen seconds: a likeness.
+    /// The shortest: a likeness.
     Fast,
-    /// About a minute and a half.
+    /// A few minutes.
     #[default]
     Balanced,
-    /// Several minutes, for the last decibel.
+    /// The longest, for the last decibel.
     Best,
 }
 
@@ -86,9 +86,9 @@ impl InvertConfig {
     /// The phases' lengths. Explicit step counts keep the effort's proportions between the pivot's phases.
     pub fn steps(&self) -> Steps {
         let of_effort = match self.effort {
-            Effort::Fast => Steps { shared: 40, free: 80, whole: 12, tune: 15, rays: 512 },
-            Effort::Balanced => Steps { shared: 80, free: 240, whole: 60, tune: 80, rays: 1024 },
-            Effort::Best => Steps { shared: 120, free: 600, whole: 200, tune: 300, rays: 2048 },
+            Effort::Fast => Steps { shared: 30, free: 60, whole: 6, tune: 8, rays: 512 },
+            Effort::Balanced => Steps { shared: 60, free: 160, whole: 24, tune: 36, rays: 1024 },
+            Effort::Best => Steps { shared: 120, free: 500, whole: 100, tune: 150, rays: 2048 },
         };
         let mut steps = of_effort;
         if let Some(pivot) = self.pivot_steps {

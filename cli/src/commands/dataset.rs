@@ -89,19 +89,29 @@ impl CheckArguments {
         let bar = console.bar(dataset.len() as u64, "check");
         let report = dataset.check(&|done| bar.set_position(done as u64));
         bar.finish_and_clear();
-        let shares: serde_json::Map<_, _> =
-            Region::ALL.iter().map(|region| (region.name().into(), json!(report.region_share[region.index()]))).collect();
-        let problems: Vec<_> =
-            report.problems.iter().map(|problem| json!({"item": problem.index, "error": problem.error.to_string()})).collect();
+        let shares: serde_json::Map<_, _> = Region::ALL
+            .iter()
+            .map(|region| (region.name().into(), json!(report.region_share[region.index()])))
+            .collect();
+        let problems: Vec<_> = report
+            .problems
+            .iter()
+            .map(|problem| json!({"item": problem.index, "error": problem.error.to_string()}))
+            .collect();
         let value = json!({
             "items": report.items, "with_mask": report.with_mask, "with_camera": report.with_camera,
             "resolutions": report.resolutions, "region_share": shares, "problems": problems,
         });
         console.result(&value, || {
-            let mut lines: Vec<String> = report.problems.iter().map(|problem| format!("bad: {}", problem.error)).collect();
+            let mut lines: Vec<String> =
+                report.problems.iter().map(|problem| format!("bad: {}", problem.error)).collect();
             lines.push(format!(
                 "{}: {} items, {} with masks, {} with cameras, {} bad",
-                self.path.display(), report.items, report.with_mask, report.with_camera, report.problems.len()
+                self.path.display(),
+                report.items,
+                report.with_mask,
+                report.with_camera,
+                report.problems.len()
             ));
             lines.join("\n")
         })?;

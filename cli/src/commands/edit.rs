@@ -129,7 +129,9 @@ impl EditArguments {
             bail!("{} --from for {} --region: give one, or one for each region", self.from.len(), self.region.len());
         }
         let pairs = self.region.iter().zip(&self.from);
-        Ok(pairs.map(|(regions, path)| (edit(*regions, Source::Portrait(path.display().to_string())), Some(path))).collect())
+        Ok(pairs
+            .map(|(regions, path)| (edit(*regions, Source::Portrait(path.display().to_string())), Some(path)))
+            .collect())
     }
 
     fn undo(self, began: std::time::Instant, console: &Console) -> anyhow::Result<Outcome> {

@@ -52,7 +52,7 @@ impl ExportArguments {
         }
         self.overwrite.check(&self.out)?;
         let began = std::time::Instant::now();
-        let opened = portraits::open(&self.portrait, &self.model)?.opened;
+        let opened = portraits::open(&self.portrait, &self.model)?;
         let spinner = console.spinner("extracting the surface");
         let mut mesh = surface::extract(&opened.generator, &opened.codes, self.resolution as usize)?;
         if self.regions != RegionSet::ALL {

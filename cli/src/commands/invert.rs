@@ -101,7 +101,9 @@ impl InvertArguments {
                     report.portraits.push(inverted);
                 }
                 Err(error) => {
-                    console.error(&error);
+                    if self.photos.len() > 1 {
+                        console.error(&error);
+                    }
                     report.failed.push(Failed { input: photo.clone(), error: format!("{error:#}") });
                 }
             }
@@ -115,7 +117,13 @@ impl InvertArguments {
         let partial = !report.failed.is_empty();
         console.result(&report, || {
             let lines = report.portraits.iter().map(|one| {
-                format!("{}  {:.1} dB  azimuth {:+.2}  elevation {:+.2}", one.output.display(), one.psnr, one.azimuth, one.elevation)
+                format!(
+                    "{}  {:.1} dB  azimuth {:+.2}  elevation {:+.2}",
+                    one.output.display(),
+                    one.psnr,
+                    one.azimuth,
+                    one.elevation
+                )
             });
             lines.collect::<Vec<_>>().join("\n")
         })?;
@@ -134,8 +142,7 @@ impl InvertArguments {
         console: &Console,
     ) -> anyhow::Result<Inverted> {
         let began = std::time::Instant::now();
-        let options =
-            PhotoOptions { face: self.face, aligned: self.aligned, pose: self.pose, mask: self.mask.clone() };
+        let options = PhotoOptions { face: self.face, aligned: self.aligned, pose: self.pose, mask: self.mask.clone() };
         let subject = Subject::read(photo, &options, None, generator.output_resolution() as u32)?;
         let model_name = self.model.model.as_deref().unwrap_or("portrait");
         let mut inverter = Inverter::new(generator, model_name, subject, self.config.clone(), perceptual)?;

@@ -95,7 +95,12 @@ impl RenderArguments {
         let report =
             Report { output: self.out, frames: frames.len(), width, height, seconds: began.elapsed().as_secs_f64() };
         console.result(&report, || {
-            format!("{}: {} frames of {width}x{height} in {:.1} s", report.output.display(), report.frames, report.seconds)
+            format!(
+                "{}: {} frames of {width}x{height} in {:.1} s",
+                report.output.display(),
+                report.frames,
+                report.seconds
+            )
         })?;
         Ok(Outcome::Done)
     }
@@ -114,7 +119,7 @@ impl RenderArguments {
     }
 
     fn key(&self, path: &Path) -> anyhow::Result<Key> {
-        let opened = portraits::open(path, &self.model)?.opened;
+        let opened = portraits::open(path, &self.model)?;
         Ok(Key { generator: opened.generator, codes: opened.codes, global: opened.global })
     }
 

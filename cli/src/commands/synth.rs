@@ -68,7 +68,8 @@ impl SynthArguments {
             if chunk.is_empty() {
                 break;
             }
-            let encoded: Vec<Result<EncodedItem, Error>> = chunk.par_iter().map(|item| encode(item, with_depth)).collect();
+            let encoded: Vec<Result<EncodedItem, Error>> =
+                chunk.par_iter().map(|item| encode(item, with_depth)).collect();
             for item in encoded {
                 writer.add(item?)?;
                 bar.inc(1);

@@ -116,8 +116,9 @@ impl TrainArguments {
     fn resolve(&self, seed: Option<u64>) -> anyhow::Result<TrainConfig> {
         let mut config = if self.resume {
             let path = self.out.join("config.toml");
-            let text = std::fs::read_to_string(&path)
-                .with_context(|| format!("{}: no run to resume here; leave --resume out to start one", path.display()))?;
+            let text = std::fs::read_to_string(&path).with_context(|| {
+                format!("{}: no run to resume here; leave --resume out to start one", path.display())
+            })?;
             TrainConfig::from_toml(&text).with_context(|| path.display().to_string())?
         } else {
             TrainConfig::preset(self.preset)
@@ -197,7 +198,8 @@ impl TrainArguments {
             model,
             steps: last.as_ref().map_or(0, |report| report.step),
             seconds: began.elapsed().as_secs_f64(),
-            metrics: last.map_or(serde_json::Value::Null, |report| serde_json::to_value(report.metrics).unwrap_or_default()),
+            metrics: last
+                .map_or(serde_json::Value::Null, |report| serde_json::to_value(report.metrics).unwrap_or_default()),
             interrupted,
         };
         let resume = format!("cnerf train --data {} --out {} --resume", self.data.display(), self.out.display());

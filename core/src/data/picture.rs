@@ -43,6 +43,7 @@ pub fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>> {
 /// Writes a file whole or not at all: to a temporary file in the same folder, then renamed over `path`.
 pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, error))?;
     let mut file = tempfile::NamedTempFile::new_in(folder).map_err(|error| Error::io(path, error))?;
     file.write_all(bytes).map_err(|error| Error::io(path, error))?;
     publish(file, path)

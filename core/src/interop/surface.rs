@@ -64,4 +64,3 @@ fn toward(field: &PortraitField, count: usize, direction: [f32; 3], generator: &
     }
     Ok(Some(Tensor::new(&[[direction]], &generator.device())?.expand((1, count, 3))?.contiguous()?))
 }
-

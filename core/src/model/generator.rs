@@ -216,7 +216,8 @@ impl Generator {
             set("z_mean", &mean)?;
             set("z_deviation", &variance.sqrt()?)?;
         }
-        let noise = Stream::new(0, &[0x6d65]).normal_tensor(&[MEAN_DRAWS, self.config.field.style_dim], &self.device())?;
+        let noise =
+            Stream::new(0, &[0x6d65]).normal_tensor(&[MEAN_DRAWS, self.config.field.style_dim], &self.device())?;
         let w = self.map(&self.spread(&noise)?)?;
         set("w_mean", &w.mean(0)?)
     }
@@ -257,7 +258,8 @@ impl Generator {
         let (Some(upsampler), Some(config)) = (&self.upsampler, &self.config.upsampler) else {
             return Ok(UpsamplerOutput { rgb: frame.colour.clone(), masks: frame.masks.clone() });
         };
-        let features = frame.features.clone().ok_or_else(|| Error::config("features", "the upsampler needs them rendered"))?;
+        let features =
+            frame.features.clone().ok_or_else(|| Error::config("features", "the upsampler needs them rendered"))?;
         let input = UpsamplerInput {
             colour: frame.colour.clone(),
             masks: frame.masks.clone(),

@@ -75,7 +75,9 @@ impl Auxiliary<'_> {
     fn loss(&self, judgement: &Judgement) -> Result<Option<Tensor>> {
         Ok(match (self, &judgement.view, &judgement.class) {
             (Self::View { angles_rad, weight }, Some(view), _) => Some((losses::view(view, angles_rad)? * *weight)?),
-            (Self::Class { labels, weight }, _, Some(class)) => Some((losses::classification(class, labels)? * *weight)?),
+            (Self::Class { labels, weight }, _, Some(class)) => {
+                Some((losses::classification(class, labels)? * *weight)?)
+            }
             _ => None,
         })
     }

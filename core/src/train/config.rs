@@ -226,7 +226,7 @@ impl TrainConfig {
             checkpoint_steps: 500,
             sample_steps: 500,
             log_steps: 20,
-            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 24 },
+            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 12 },
             warmup: WarmupConfig {
                 steps: 4_000,
                 batch: 32,
@@ -277,7 +277,7 @@ impl TrainConfig {
                 perceptual: 1.0,
                 adversarial: 0.0,
                 channel_multiplier: 0.125,
-                    average_half_life_images: 1_000.0,
+                average_half_life_images: 1_000.0,
                 ..Self::paper_upsampler_stage()
             },
         }
@@ -424,10 +424,14 @@ impl TrainConfig {
                 .or_else(|_| toml::from_str(&format!("value = {value:?}")))
                 .map_err(|error| Error::config(format!("--set {path}"), error.message()))?;
             let parsed = parsed.get("value").cloned().unwrap_or(toml::Value::Boolean(false));
-            // Whole numbers may be written where a real one is meant.
             *place = match (&*place, parsed) {
+                // Whole numbers may be written where a real one is meant.
                 (toml::Value::Float(_), toml::Value::Integer(whole)) => toml::Value::Float(whole as f64),
-                (_, parsed) => parsed,
+                (known, parsed) if known.same_type(&parsed) => parsed,
+                (known, _) => {
+                    let reason = format!("`{value}` is not of the type {}", known.type_str());
+                    return Err(Error::config(format!("--set {path}"), reason));
+                }
             };
         }
         let config: Self = tree.try_into().map_err(|error: toml::de::Error| Error::config("--set", error.message()))?;

@@ -47,6 +47,8 @@ pub struct FieldStage {
     inputs: (Arc<crate::data::dataset::Dataset>, LoaderConfig),
     perceptual: Option<Perceptual>,
     generator: Generator,
+    /// Codes of the training portraits from a warm-up, for the stage after this one.
+    portrait_codes: Option<Tensor>,
     average: Average,
     global: Discriminator,
     semantic: Discriminator,
@@ -79,7 +81,11 @@ impl FieldStage {
         };
         let discriminators = Parameters::fresh(config.seed, DType::F32, &inputs.device);
         let discriminator = |kind, name: &str| {
-            let config = DiscriminatorConfig { kind, resolution: stage.resolution, channel_multiplier: stage.channel_multiplier };
+            let config = DiscriminatorConfig {
+                kind,
+                resolution: stage.resolution,
+                channel_multiplier: stage.channel_multiplier,
+            };
             Discriminator::new(&config, &discriminators.within(name))
         };
         let global = discriminator(DiscriminatorKind::Global, "global")?;
@@ -102,6 +108,7 @@ impl FieldStage {
             next_batch: 0,
             inputs: (Arc::clone(&inputs.dataset), loader_config),
             perceptual: inputs.perceptual.clone(),
+            portrait_codes: start.and_then(|start| start.portrait_codes.clone()),
             average: Average::of(generator.parameters(), stage.average_half_life_images)?,
             config: stage,
             seed: config.seed,
@@ -148,7 +155,8 @@ impl FieldStage {
         let field = self.generator.field().portraits(codes)?;
         let parameters = Camera::parameter_tensor(cameras, &self.device)?;
         let pixels = camera::pixel_centres(settings.resolution, &self.device)?;
-        let rays = RayBundle::new(camera::cast(&parameters, &pixels, settings.resolution, settings.field_of_view_rad)?)?;
+        let rays =
+            RayBundle::new(camera::cast(&parameters, &pixels, settings.resolution, settings.field_of_view_rad)?)?;
         let (batch, count) = rays.dimensions()?;
         let depths = sampling.perturbed(batch, count, random, DType::F32, &self.device)?;
         let output = render_rays(&field, &rays, &depths, &sampling, outputs, RegionSet::ALL)?;
@@ -205,7 +213,8 @@ impl FieldStage {
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
         let codes = self.draw_codes(&mut random)?;
         let cameras = self.draw_cameras(&mut random);
-        let fakes = self.render(&codes, &cameras, Outputs { colour: true, gradient: true, ..Outputs::default() }, &mut random)?;
+        let fakes =
+            self.render(&codes, &cameras, Outputs { colour: true, gradient: true, ..Outputs::default() }, &mut random)?;
         let pictures = Pictures { image: &fakes.image, masks: &fakes.masks };
         let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
         let terms = generator_terms(&self.global, pictures, view)?;
@@ -242,7 +251,8 @@ impl FieldStage {
         let first = codes::broadcast(&self.draw_w(random)?)?;
         let second = codes::broadcast(&self.draw_w(random)?)?;
         let cameras = self.draw_cameras(random);
-        let cross = |shape: &Tensor, texture: &Tensor| Tensor::cat(&[shape.narrow(2, 0, 1)?, texture.narrow(2, 1, 1)?], 2);
+        let cross =
+            |shape: &Tensor, texture: &Tensor| Tensor::cat(&[shape.narrow(2, 0, 1)?, texture.narrow(2, 1, 1)?], 2);
         let outputs = Outputs { colour: true, ..Outputs::default() };
         // The same rays for all four, so that masks differ by their codes alone.
         let seed = random.bits();
@@ -309,7 +319,7 @@ impl StageRun for FieldStage {
         let generator = self.generator.duplicate()?;
         self.average.apply(generator.parameters())?;
         generator.measure(None)?;
-        Ok(Start { generator, portrait_codes: None })
+        Ok(Start { generator, portrait_codes: self.portrait_codes.clone() })
     }
 }
 

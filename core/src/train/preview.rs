@@ -53,7 +53,9 @@ pub fn random_grid(generator: &Generator) -> Result<RgbImage> {
     const COUNT: u64 = 6;
     let codes = (0..COUNT).map(|seed| generator.codes_from_seed(seed, 0.7)).collect::<Result<Vec<_>>>()?;
     let codes = Tensor::cat(&codes, 0)?;
-    let at = |azimuth_rad: f64| Camera::parameter_tensor(&[Camera::at(azimuth_rad, 0.0); COUNT as usize], &generator.device());
+    let at = |azimuth_rad: f64| {
+        Camera::parameter_tensor(&[Camera::at(azimuth_rad, 0.0); COUNT as usize], &generator.device())
+    };
     let front = pictures(generator, &codes, &at(0.0)?)?;
     let mut rows = vec![picture::from_tensor(&front.rgb)?, region_maps(&front)?];
     rows.extend(normals(&front)?);

@@ -62,7 +62,12 @@ impl Start {
         let path = path.with_file_name(CODES_FILE);
         let portrait_codes = if path.is_file() {
             let (mut tensors, _) = file::parse_safetensors(&path, &file::read_bytes(&path)?)?;
-            Some(tensors.remove(CODES).ok_or_else(|| Error::malformed(&path, "holds no portrait codes"))?.to_device(device)?)
+            Some(
+                tensors
+                    .remove(CODES)
+                    .ok_or_else(|| Error::malformed(&path, "holds no portrait codes"))?
+                    .to_device(device)?,
+            )
         } else {
             None
         };
@@ -118,7 +123,10 @@ impl Trainer {
     /// A new run in the folder `run`, which must not hold one yet.
     pub fn new(config: TrainConfig, stage: Stage, inputs: Inputs, run: &Path) -> Result<Self> {
         if run.join("config.toml").exists() {
-            return Err(Error::malformed(run, "holds a run already; pass --resume to continue it or choose another folder"));
+            return Err(Error::malformed(
+                run,
+                "holds a run already; pass --resume to continue it or choose another folder",
+            ));
         }
         let trainer = Self::open(config, stage, inputs, run)?;
         file::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
@@ -130,7 +138,10 @@ impl Trainer {
         let mut trainer = Self::open(config, stage, inputs, run)?;
         if let Some((path, header, tensors)) = trainer.checkpoints.newest()? {
             let position = trainer.stages.iter().position(|known| *known == header.stage).ok_or_else(|| {
-                Error::malformed(&path, format!("was written by stage {:?}, which this run does not have", header.stage))
+                Error::malformed(
+                    &path,
+                    format!("was written by stage {:?}, which this run does not have", header.stage),
+                )
             })?;
             if position > 0 {
                 // The stages before are done: their result lies in the run's folder.
@@ -211,7 +222,11 @@ impl Trainer {
         let finished = current.stage.finished()?;
         let path = self.run.join("model.safetensors");
         finished.save_codes(&self.run)?;
-        finished.generator.save(&path, &format!("{:?}", self.config.preset).to_lowercase(), &self.provenance(current.position))?;
+        finished.generator.save(
+            &path,
+            &format!("{:?}", self.config.preset).to_lowercase(),
+            &self.provenance(current.position),
+        )?;
         let events = vec![Event::Model(path)];
         self.finished = Some(finished);
         if current.position + 1 < self.stages.len() {
@@ -236,7 +251,13 @@ impl Trainer {
             .iter()
             .map(|stage| format!("{} {} steps", format!("{stage:?}").to_lowercase(), steps(&self.config, *stage)))
             .collect();
-        format!("trained by cnerf {}: {}; {} portraits; seed {}", env!("CARGO_PKG_VERSION"), stages.join(", "), self.inputs.dataset.len(), self.config.seed)
+        format!(
+            "trained by cnerf {}: {}; {} portraits; seed {}",
+            env!("CARGO_PKG_VERSION"),
+            stages.join(", "),
+            self.inputs.dataset.len(),
+            self.config.seed
+        )
     }
 
     fn write_checkpoint(&mut self, current: &Current) -> Result<PathBuf> {
@@ -278,7 +299,9 @@ impl Trainer {
         match error {
             Error::NotFinite { quantity, context: None } => {
                 let context = match &self.last_checkpoint {
-                    Some(path) => format!("the last good checkpoint is {}; resume with a lower learning rate", path.display()),
+                    Some(path) => {
+                        format!("the last good checkpoint is {}; resume with a lower learning rate", path.display())
+                    }
                     None => "no checkpoint was written yet; start again with a lower learning rate".into(),
                 };
                 Error::NotFinite { quantity, context: Some(context) }
@@ -291,13 +314,19 @@ impl Trainer {
 /// The stages a run consists of; `all` takes those that the configuration gives steps.
 fn stages(config: &TrainConfig, stage: Stage) -> Result<Vec<Stage>> {
     let stages = match stage {
-        Stage::All => [Stage::Warmup, Stage::Field, Stage::Upsampler].into_iter().filter(|stage| steps(config, *stage) > 0).collect(),
+        Stage::All => [Stage::Warmup, Stage::Field, Stage::Upsampler]
+            .into_iter()
+            .filter(|stage| steps(config, *stage) > 0)
+            .collect(),
         single => vec![single],
     };
     match stages.iter().find(|stage| steps(config, **stage) == 0) {
         Some(stage) => {
             let name = format!("{stage:?}").to_lowercase();
-            Err(Error::config(format!("{name}.steps"), format!("this preset gives stage {name} no steps; pass --set {name}.steps=N or --kimg")))
+            Err(Error::config(
+                format!("{name}.steps"),
+                format!("this preset gives stage {name} no steps; pass --set {name}.steps=N or --kimg"),
+            ))
         }
         None if stages.is_empty() => Err(Error::config("--stage", "no stage has any steps")),
         None => Ok(stages),

@@ -89,10 +89,14 @@ impl UpsamplerStage {
     pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>) -> Result<Self> {
         let stage = config.upsampler.clone();
         let start = start.ok_or_else(|| {
-            Error::config("--stage upsampler", "needs a trained field; pass --model RUN/model.safetensors or --stage all")
+            Error::config(
+                "--stage upsampler",
+                "needs a trained field; pass --model RUN/model.safetensors or --stage all",
+            )
         })?;
         let wanted = config.model.upsampler.as_ref();
-        let wanted = wanted.ok_or_else(|| Error::config("model.upsampler", "this configuration has no upsampler to train"))?;
+        let wanted =
+            wanted.ok_or_else(|| Error::config("model.upsampler", "this configuration has no upsampler to train"))?;
         let generator = if start.generator.config().upsampler.as_ref() == Some(wanted) {
             start.generator.duplicate()?
         } else {
@@ -168,7 +172,8 @@ impl UpsamplerStage {
         let resolution = self.generator.output_resolution();
         let batch = paired.portraits.batch(step as u64, &draws)?;
         let target = batch.at(resolution)?.images.to_device(&self.device)?;
-        let target = target.narrow(2, top * factor, crop * factor)?.narrow(3, left * factor, crop * factor)?.contiguous()?;
+        let target =
+            target.narrow(2, top * factor, crop * factor)?.narrow(3, left * factor, crop * factor)?.contiguous()?;
         let rows: Vec<u32> = rows.iter().map(|row| *row as u32).collect();
         let z = paired.codes.index_select(&Tensor::from_vec(rows, frames.len(), &self.device)?, 0)?;
         let codes = codes::broadcast(&self.generator.map(&z)?.detach())?;
@@ -180,7 +185,8 @@ impl UpsamplerStage {
         if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0) {
             let [x, y] = [random.below(LARGEST_SHIFT + 1), random.below(LARGEST_SHIFT + 1)];
             let side = crop * factor;
-            let shifted = |t: &Tensor| t.narrow(2, y, side - LARGEST_SHIFT)?.narrow(3, x, side - LARGEST_SHIFT)?.contiguous();
+            let shifted =
+                |t: &Tensor| t.narrow(2, y, side - LARGEST_SHIFT)?.narrow(3, x, side - LARGEST_SHIFT)?.contiguous();
             let distance = perceptual.distance(&shifted(&output.rgb)?, &shifted(&target)?)?.mean_all()?;
             metrics.push("perceptual", scalar(&distance)?);
             total = (total + (distance * config.perceptual)?)?;
@@ -321,7 +327,8 @@ impl StageRun for UpsamplerStage {
         let mut metrics = Metrics::default();
         let losses = [self.paired_loss(step, &mut metrics)?, self.adversarial_loss(step, &mut metrics)?];
         let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
-        let total = total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
+        let total =
+            total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
         finite(&metrics)?;
         let factor = self.config.schedule.factor(step, self.config.steps);
         let norms = self.optimiser.step(&total.backward()?, factor)?;

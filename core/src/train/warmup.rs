@@ -87,7 +87,8 @@ impl Warmup {
         let codes = Var::from_tensor(&whiten(&features, generator.config().field.style_dim, config.seed)?)?;
 
         let under = |prefix: &str| generator.parameters().within(prefix).variables();
-        let (alpha, field): (Vec<_>, Vec<_>) = under("field").into_iter().partition(|(name, _)| name.ends_with("log_alpha"));
+        let (alpha, field): (Vec<_>, Vec<_>) =
+            under("field").into_iter().partition(|(name, _)| name.ends_with("log_alpha"));
         let log_alpha = alpha.into_iter().next().map(|(_, variable)| variable);
         let log_alpha = log_alpha.ok_or_else(|| Error::shape("field.log_alpha", [1], &[]))?;
         let group = |variables, learning_rate, bound| Group { variables, learning_rate, largest_gradient_norm: bound };
@@ -133,8 +134,10 @@ impl Warmup {
             // Weighted draws without replacement: the largest u^(1/w) win (Efraimidis and Spirakis, 2006).
             let mut keys: Vec<(f32, usize)> = Vec::with_capacity(resolution * resolution);
             for pixel in 0..resolution * resolution {
-                let shares = level.pixel(draw, pixel % resolution, pixel / resolution).map_or([0; REGION_COUNT], |p| p.1);
-                let detail: f32 = shares[Region::Eyes.index()..=Region::Ears.index()].iter().map(|s| f32::from(*s)).sum();
+                let shares =
+                    level.pixel(draw, pixel % resolution, pixel / resolution).map_or([0; REGION_COUNT], |p| p.1);
+                let detail: f32 =
+                    shares[Region::Eyes.index()..=Region::Ears.index()].iter().map(|s| f32::from(*s)).sum();
                 let weight = 1.0 + config.detail_boost as f32 * detail / 255.0;
                 keys.push((random.uniform().max(1e-12).ln() / weight, pixel));
             }
@@ -183,7 +186,8 @@ impl Warmup {
         let foreground = batch.masks.narrow(1, 0, 1)?.squeeze(1)?.affine(-1.0, 1.0)?;
         let opacity = losses::opacity(&output.weights.remaining.affine(-1.0, 1.0)?, &foreground)?;
         let minimal_surface = losses::minimal_surface(&output.evaluation.distance, MINIMAL_SURFACE_SHARPNESS)?;
-        let colours = output.evaluation.colours.as_ref().ok_or_else(|| Error::config("fill", "the field gave no colours"))?;
+        let colours =
+            output.evaluation.colours.as_ref().ok_or_else(|| Error::config("fill", "the field gave no colours"))?;
         let fill = losses::fill(colours, &output.weights, &self.region_colours(batch, colours.dim(1)?)?)?;
         let points = self.eikonal_points(batch, &bundle.points(&depths)?)?;
         let gradient = field.evaluate(&points, None, Outputs { gradient: true, ..Outputs::default() })?.gradient;
@@ -231,7 +235,12 @@ impl Warmup {
     fn sampling(&self) -> Sampling {
         let [near, far] = self.config.depth_range;
         let samples = self.config.samples;
-        Sampling { near, far, last_interval: Some((far - near) / samples as f64), ..Sampling::behind_the_surface(samples) }
+        Sampling {
+            near,
+            far,
+            last_interval: Some((far - near) / samples as f64),
+            ..Sampling::behind_the_surface(samples)
+        }
     }
 
     fn set_alpha(&self, progress: f64) -> Result<()> {
@@ -370,7 +379,13 @@ mod tests {
             let radius = 8.0 + (index % 5) as f32;
             let region = |x: u32, y: u32| {
                 let inside = (x as f32 - 15.5).hypot(y as f32 - 15.5) < radius;
-                if !inside { 0 } else if y < 12 { Region::Hair as u8 } else { Region::Face as u8 }
+                if !inside {
+                    0
+                } else if y < 12 {
+                    Region::Hair as u8
+                } else {
+                    Region::Face as u8
+                }
             };
             let picture = RgbImage::from_fn(32, 32, |x, y| {
                 image::Rgb(match region(x, y) {

@@ -18,7 +18,8 @@ const SUBSPACE_ITERATIONS: usize = 6;
 pub fn whiten(data: &Tensor, rank: usize, seed: u64) -> Result<Tensor> {
     let (rows, _) = data.dims2()?;
     if rank >= rows {
-        let reason = format!("{rows} portraits cannot fill codes of length {rank}; use more portraits or a smaller style_dim");
+        let reason =
+            format!("{rows} portraits cannot fill codes of length {rank}; use more portraits or a smaller style_dim");
         return Err(Error::config("field.style_dim", reason));
     }
     let centred = data.to_dtype(DType::F32)?.broadcast_sub(&data.to_dtype(DType::F32)?.mean_keepdim(0)?)?;
