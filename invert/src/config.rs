@@ -19,7 +19,7 @@ pub enum Effort {
 }
 
 /// Everything an inversion may be told.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 #[serde(default, deny_unknown_fields)]
 pub struct InvertConfig {
@@ -44,20 +44,6 @@ pub struct InvertConfig {
     /// Learning rates and weights of the tuning.
     #[cfg_attr(feature = "clap", arg(skip))]
     pub tune: TuneConfig,
-}
-
-impl Default for InvertConfig {
-    fn default() -> Self {
-        Self {
-            effort: Effort::default(),
-            pivot_steps: None,
-            tune_steps: None,
-            fixed_camera: false,
-            seed: 0,
-            pivot: PivotConfig::default(),
-            tune: TuneConfig::default(),
-        }
-    }
 }
 
 /// How long each phase runs.

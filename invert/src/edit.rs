@@ -104,7 +104,7 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
         before = after;
     }
     let change = measure(&first, &before, all)?;
-    let [before_picture, after_picture] = [&first.rgb, &before.rgb].map(|rgb| one_picture(rgb));
+    let [before_picture, after_picture] = [&first.rgb, &before.rgb].map(one_picture);
     let edited = Edited {
         change,
         before: before_picture?,
@@ -124,7 +124,7 @@ impl Edit {
         if self.regions.is_empty() {
             return Err(Error::config("--region", "names no region"));
         }
-        if !(self.amount.abs() <= FARTHEST) {
+        if self.amount.is_nan() || self.amount.abs() > FARTHEST {
             return Err(Error::config(
                 "--amount",
                 format!("{} is not between -{FARTHEST} and {FARTHEST}", self.amount),

@@ -359,7 +359,7 @@ impl Cached {
             progress(done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
             Ok((camera, packed))
         });
-        let decoded: Vec<(Camera, Vec<(Vec<u8>, Vec<u8>)>)> = decoded.collect::<Result<_>>()?;
+        let decoded = decoded.collect::<Result<Vec<_>>>()?;
         let mut levels: Vec<_> = resolutions
             .iter()
             .map(|&resolution| {

@@ -239,8 +239,8 @@ mod tests {
             };
             shape_texture_decoupling(renders, features, margin)
         };
-        for index in 0..5 {
-            check(&format!("L_STD input {index}"), &tensors[index], |x| renders(index, x, 10.0));
+        for (index, tensor) in tensors.iter().enumerate().take(5) {
+            check(&format!("L_STD input {index}"), tensor, |x| renders(index, x, 10.0));
         }
         let value = |margin| number(&renders(5, &tensors[0], margin).unwrap());
         let masks = number(&mean_absolute(&tensors[0], &tensors[1]).unwrap());

@@ -1,7 +1,7 @@
 //! Sheets of cartoon portraits to look at: many heads at a dataset's cameras, their label maps and normals, or a few
 //! heads all around.
 //!
-//! `cartoon_sheet OUT.png [rgb|labels|normals|views|styles|big] [--seed S] [--size PIXELS] [--heads N] [--edge-samples N]`
+//! `cartoon_sheet OUT.png [rgb|labels|normals|views|styles] [--seed S] [--size PIXELS] [--heads N] [--edge-samples N]`
 
 use std::{path::PathBuf, time::Instant};
 
@@ -40,7 +40,7 @@ fn main() -> Result<()> {
             (heads.isqrt().max(1), tiles)
         }
         "views" => {
-            let azimuths = [-1.2, -0.8, -0.4, 0.0, 0.4, 0.8, 1.57, 3.14];
+            let azimuths = [-1.2, -0.8, -0.4, 0.0, 0.4, 0.8, 1.57, std::f64::consts::PI];
             let tiles = (0..heads).flat_map(|head| {
                 let portrait = Portrait::new(&Identity::sample(SynthOptions::identity_seed(seed, head)));
                 azimuths.map(|azimuth| {
@@ -57,7 +57,7 @@ fn main() -> Result<()> {
             (azimuths.len(), tiles.collect())
         }
         "styles" => {
-            let azimuths = [0.0, 0.6, 1.57, 3.14];
+            let azimuths = [0.0, 0.6, 1.57, std::f64::consts::PI];
             let tiles = HairStyle::ALL.into_iter().enumerate().flat_map(|(head, style)| {
                 let mut identity = Identity::sample(SynthOptions::identity_seed(seed, head));
                 identity.hair.style = style;

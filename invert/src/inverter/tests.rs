@@ -77,7 +77,7 @@ fn losses_fall_and_the_file_gives_back_what_was_measured() {
     let generator = small_generator(3);
     // Somebody another model made: this one's codes cannot reach them, tuning must help.
     let subject = subject(&small_generator(11), true);
-    let photo = picture::to_tensor(&[subject.aligned.picture.clone()], &Device::Cpu).unwrap();
+    let photo = picture::to_tensor(std::slice::from_ref(&subject.aligned.picture), &Device::Cpu).unwrap();
     let view = Camera::parameter_tensor(&[subject.aligned.camera], &Device::Cpu).unwrap();
     let mean = whole_picture(&generator, &generator.mean_codes().unwrap(), None, &view, false).unwrap();
     let start = psnr(&mean.rgb, &photo).unwrap();

@@ -61,7 +61,7 @@ impl Backdrop {
             }
             BackgroundKind::Flat | BackgroundKind::Gradient => {}
         }
-        let phases = [stream.range(0.0, 6.28), stream.range(0.0, 6.28)];
+        let phases = [stream.range(0.0, std::f32::consts::TAU), stream.range(0.0, std::f32::consts::TAU)];
         Self { kind: background.kind, lower, upper, accent, discs, phases }
     }
 

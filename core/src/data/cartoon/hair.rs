@@ -40,7 +40,7 @@ pub(super) fn build(builder: &mut Builder, identity: &Identity, anatomy: &Anatom
         stream: Stream::new(hair.tousle, &[0x4a1a]),
     };
     match hair.style {
-        HairStyle::Bald => return,
+        HairStyle::Bald => {}
         HairStyle::Buzz => {
             barber.builder.paint(Region::Hair, Material::Stubble);
             barber.short_cap(0.04);
@@ -391,7 +391,7 @@ impl Barber<'_> {
         let side = self.side;
         let length = 0.7 + 0.6 * self.length;
         let out = (seat - self.anatomy.skull).normalize_or(Vec3::Y);
-        let end = seat + vec3(0.25 * side, -1.0 * length - 0.3, -0.3);
+        let end = seat + vec3(0.25 * side, -length - 0.3, -0.3);
         let knots = [
             (seat, 0.13),
             (seat + 0.28 * out, 0.2 + 0.05 * self.volume),

@@ -317,7 +317,7 @@ impl Scene {
                     Cell { distance: distance - STEEPNESS * (centre - middle).length(), ..empty }
                 } else {
                     let distance = self.cull(centre, CELL_RADIUS, &in_block, &mut in_cell, &mut distances);
-                    if distance > EXACT_WITHIN + CELL_RADIUS || distance < -0.04 - CELL_RADIUS {
+                    if !(-0.04 - CELL_RADIUS..=EXACT_WITHIN + CELL_RADIUS).contains(&distance) {
                         Cell { distance, ..empty }
                     } else {
                         let first = self.members.len() as u32;

@@ -133,7 +133,7 @@ impl PaddedSource {
             && self.stride == 1
             && self.lead == [0, 0]
             && self.grid == self.size
-            && self.grid[1] % 16 == 0
+            && self.grid[1].is_multiple_of(16)
     }
 
     /// Distance of two rows of a plane.

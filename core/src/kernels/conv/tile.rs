@@ -73,8 +73,8 @@ mod x86 {
         // SAFETY: the caller vouches for AVX and for both squares.
         unsafe {
             let (r0, r1, r2, r3) = (
-                _mm256_loadu_ps(from.add(0 * from_stride)),
-                _mm256_loadu_ps(from.add(1 * from_stride)),
+                _mm256_loadu_ps(from),
+                _mm256_loadu_ps(from.add(from_stride)),
                 _mm256_loadu_ps(from.add(2 * from_stride)),
                 _mm256_loadu_ps(from.add(3 * from_stride)),
             );
