@@ -5,17 +5,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
+pub use cnerf_kernels::{FILM_LAYERS, SHAPE_LAYERS, SdfHead, TEXTURE_LAYERS};
 
-/// Which branch of a local generator carries the residual distance head.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum SdfHead {
-    /// After the three shape layers: a texture code cannot move a surface.
-    Shape,
-    /// After the two texture layers, as in the authors' code.
-    Texture,
-}
+use crate::error::{Error, Result};
 
 /// How local residuals join the global distance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -85,13 +77,6 @@ pub struct FilmConfig {
     /// 0.25 in both.
     pub beta_gain: f64,
 }
-
-/// Number of FiLM-SIREN layers driven by the shape code (paper).
-pub const SHAPE_LAYERS: usize = 3;
-/// Number of FiLM-SIREN layers driven by the texture code (paper).
-pub const TEXTURE_LAYERS: usize = 2;
-/// All FiLM-SIREN layers of a local generator.
-pub const FILM_LAYERS: usize = SHAPE_LAYERS + TEXTURE_LAYERS;
 
 /// The compositional field.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

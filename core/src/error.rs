@@ -57,6 +57,17 @@ pub enum Error {
 /// The core library's result.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
+impl From<cnerf_kernels::Error> for Error {
+    fn from(error: cnerf_kernels::Error) -> Self {
+        match error {
+            cnerf_kernels::Error::Shape { name, expected, found } => Self::Shape { name, expected, found },
+            cnerf_kernels::Error::Config { option, reason } => Self::Config { option, reason },
+            cnerf_kernels::Error::Tensor(error) => Self::Tensor(error),
+            error => Self::config("kernel", error),
+        }
+    }
+}
+
 impl Error {
     /// An [`Error::Io`] at `path`; made to be used as `.map_err(|e| Error::io(path, e))`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {

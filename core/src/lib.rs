@@ -12,7 +12,6 @@ pub mod data;
 pub mod error;
 pub mod eval;
 pub mod interop;
-pub mod kernels;
 pub mod model;
 pub mod parameters;
 pub mod region;
@@ -20,4 +19,5 @@ pub mod render;
 pub mod rng;
 pub mod train;
 
+pub use cnerf_kernels as kernels;
 pub use error::{Error, Result};

@@ -249,7 +249,7 @@ impl Kernel {
             (6, None) => Tensor::cat(&[&inputs, &inputs.zeros_like()?], 2)?,
             _ => inputs,
         };
-        autograd::evaluate(&inputs, &self.weights, &self.film, self.shape, outputs)
+        Ok(autograd::evaluate(&inputs, &self.weights, &self.film, self.shape, outputs)?)
     }
 
     fn detached(&self) -> Self {

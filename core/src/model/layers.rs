@@ -28,7 +28,7 @@ pub fn convolve(
         let mixed = mix_channels(&weight.reshape((outputs, inputs))?, input)?;
         return bias.map_or_else(|| Ok(mixed.clone()), |bias| add_bias(&mixed, bias));
     }
-    conv::conv2d(input, weight, bias, stride, padding)
+    Ok(conv::conv2d(input, weight, bias, stride, padding)?)
 }
 
 /// The adjoint of [`convolve`]: takes the gradient `[B, O, h', w']` of its output to the gradient `[B, I, size]` of its
@@ -44,7 +44,7 @@ pub fn convolve_adjoint(
     if kernel == 1 && stride == 1 && padding == 0 {
         return mix_channels(&weight.reshape((outputs, inputs))?.t()?, gradient);
     }
-    conv::conv2d_input_gradient(gradient, weight, size, stride, padding)
+    Ok(conv::conv2d_input_gradient(gradient, weight, size, stride, padding)?)
 }
 
 /// `[O, I]` applied to every pixel of `[B, I, h, w]`.

@@ -8,13 +8,13 @@
 
 use std::{ops::Range, sync::OnceLock};
 
-use crate::{
-    config::{FILM_LAYERS, SHAPE_LAYERS, SdfHead},
-    error::{Error, Result},
-};
+use serde::{Deserialize, Serialize};
 
 #[cfg(test)]
 mod agreement;
+mod error;
+#[cfg(test)]
+mod random;
 
 pub mod activation;
 pub mod autograd;
@@ -23,6 +23,25 @@ pub mod conv;
 pub mod fused;
 pub mod plain;
 pub mod simd;
+
+pub use error::{Error, Result};
+
+/// Which branch of a local generator carries the residual distance head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SdfHead {
+    /// After the three shape layers: a texture code cannot move a surface.
+    Shape,
+    /// After the two texture layers, as in the authors' code.
+    Texture,
+}
+
+/// Number of FiLM-SIREN layers driven by the shape code (paper).
+pub const SHAPE_LAYERS: usize = 3;
+/// Number of FiLM-SIREN layers driven by the texture code (paper).
+pub const TEXTURE_LAYERS: usize = 2;
+/// All FiLM-SIREN layers of a local generator.
+pub const FILM_LAYERS: usize = SHAPE_LAYERS + TEXTURE_LAYERS;
 
 /// What decides a local generator's weights: its width and what its heads read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -17,8 +17,8 @@ use super::{
     region::{AngleBounds, FoldedLayout, GradientLayout, Plan, Sweep},
 };
 use crate::{
-    config::{FILM_LAYERS, SHAPE_LAYERS},
-    kernels::simd::{LARGEST_ANGLE, Lanes},
+    FILM_LAYERS, SHAPE_LAYERS,
+    simd::{LARGEST_ANGLE, Lanes},
 };
 
 static ONES: [f32; TILE] = [1.0; TILE];

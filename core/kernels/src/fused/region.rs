@@ -4,10 +4,7 @@
 use std::ops::{Deref, DerefMut};
 
 use super::products::{PADDING, panel_columns};
-use crate::{
-    config::{FILM_LAYERS, SHAPE_LAYERS},
-    kernels::{HeadShape, Layout, Outputs, Rows, simd::Lanes},
-};
+use crate::{FILM_LAYERS, HeadShape, Layout, Outputs, Rows, SHAPE_LAYERS, simd::Lanes};
 
 /// Values of FiLM for one (image, region): γ and β of every layer.
 pub fn film_len(shape: HeadShape) -> usize {
@@ -60,7 +57,7 @@ impl Plan {
         let (layout, rows) = (shape.layout(), shape.rows(outputs));
         let depth = shape.depth(outputs);
         let residual_depth = shape.residual_depth();
-        let head = |linear: &crate::kernels::Linear, output: usize, first_row: usize| Head {
+        let head = |linear: &crate::Linear, output: usize, first_row: usize| Head {
             weight: linear.weight.start + output * linear.inputs,
             bias: linear.bias.start + output,
             view: linear.inputs > shape.width,

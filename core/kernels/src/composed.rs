@@ -6,10 +6,7 @@
 use candle_core::{D, Tensor};
 
 use super::{HeadShape, Linear, Outputs};
-use crate::{
-    config::{FILM_LAYERS, SHAPE_LAYERS},
-    error::{Error, Result},
-};
+use crate::{Error, FILM_LAYERS, Result, SHAPE_LAYERS};
 
 /// Evaluates every region at every point of its image.
 ///
@@ -132,7 +129,7 @@ mod tests {
     use candle_core::{DType, Device, Var};
 
     use super::*;
-    use crate::{config::SdfHead, rng::Stream};
+    use crate::{SdfHead, random::Stream};
 
     /// Central differences of a fixed random functional of the result, along one random direction of each input.
     #[test]

@@ -3,7 +3,7 @@
 use candle_core::{CpuStorage, CustomOp3, DType, Device, Layout, Shape, Storage, Tensor};
 
 use super::{Evaluation, Extent, Gradients, HeadShape, Outputs, RegionKernel, composed, selected};
-use crate::error::Result;
+use crate::Result;
 
 /// Evaluates every region at every point of its image, differentiable to first order in all three tensors; gradient
 /// rows are differentiable too, so a loss on them is the exact double backward.

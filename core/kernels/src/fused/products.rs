@@ -7,7 +7,7 @@
 // One contract covers every function here, stated at `Lanes`; pointers must be valid for the stated sizes.
 #![allow(clippy::missing_safety_doc, clippy::too_many_arguments)]
 
-use crate::kernels::simd::{Lanes, cos, sin};
+use crate::simd::{Lanes, cos, sin};
 
 /// Points of a full tile: with a width near 48 a tile's matrices stay in the first-level cache.
 pub const TILE: usize = 48;

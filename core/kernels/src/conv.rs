@@ -32,7 +32,7 @@ use candle_core::{CpuStorage, CustomOp2, CustomOp3, DType, Layout, Shape, Tensor
 use self::activation::ChannelSums;
 pub use self::activation::{bias_leaky_relu, leaky_relu_gradient};
 use self::geometry::Geometry;
-use crate::{Error, Result, kernels};
+use crate::{Error, Result};
 
 /// The convolution (in the networks' sense, i.e. the correlation) of `input` `[B, C, H, W]` by `weight`
 /// `[O, C, kh, kw]`, plus `bias` `[O]`: `[B, O, Ho, Wo]` with `Ho = ⌊(H + 2·padding − kh) / stride⌋ + 1`.
@@ -198,7 +198,7 @@ impl InstructionSet {
             Self::Avx512 => of::<std::arch::x86_64::__m512>(),
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => of::<std::arch::x86_64::__m256>(),
-            _ => of::<kernels::simd::Portable>(),
+            _ => of::<crate::simd::Portable>(),
         }
     }
 }
@@ -206,7 +206,7 @@ impl InstructionSet {
 impl Path {
     /// The counterpart of the fields' [`kernels::selected`], so that one variable chooses for both.
     fn chosen() -> Result<Self> {
-        let instruction_set = match kernels::selected()?.name() {
+        let instruction_set = match crate::selected()?.name() {
             "plain" => return Ok(Self::Plain),
             "avx512" => InstructionSet::Avx512,
             "avx2" => InstructionSet::Avx2,

@@ -14,7 +14,7 @@ use self::{
     tile::{ResultRows, Tile, TileGradients},
 };
 use super::{Evaluation, Extent, Gradients, RegionKernel, check_length, simd::Lanes};
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 
 mod products;
 mod region;
@@ -206,7 +206,7 @@ instruction_set!(
     is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
     "avx2,fma"
 );
-instruction_set!(PORTABLE, portable, "portable", crate::kernels::simd::Portable, 4, true);
+instruction_set!(PORTABLE, portable, "portable", crate::simd::Portable, 4, true);
 
 impl Fused {
     fn check(&self) -> Result<()> {

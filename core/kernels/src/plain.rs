@@ -4,10 +4,7 @@
 use std::ops::{Add, AddAssign, Mul, Sub};
 
 use super::{Evaluation, Gradients, HeadShape, Layout, Linear, RegionKernel, Rows, check_length};
-use crate::{
-    config::{FILM_LAYERS, SHAPE_LAYERS},
-    error::Result,
-};
+use crate::{FILM_LAYERS, Result, SHAPE_LAYERS};
 
 /// A floating-point number: f32 or f64.
 pub trait Real:

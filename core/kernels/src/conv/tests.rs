@@ -3,7 +3,7 @@
 use candle_core::{DType, Device, Tensor, Var};
 
 use super::*;
-use crate::rng::Stream;
+use crate::random::Stream;
 
 /// Kernel size, stride and padding of every kind of convolution in the networks, and a few in none.
 const KINDS: [[usize; 3]; 11] = [

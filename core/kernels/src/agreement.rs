@@ -6,10 +6,7 @@ use super::{
     Evaluation, Extent, Gradients, HeadShape, Outputs, RegionKernel, autograd, composed, fused, kernels, plain::Plain,
     select,
 };
-use crate::{
-    config::{FILM_LAYERS, SdfHead},
-    rng::Stream,
-};
+use crate::{FILM_LAYERS, SdfHead, random::Stream};
 
 const ALL: Outputs = Outputs { gradient: true, colour: true, activations: true };
 

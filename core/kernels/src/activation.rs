@@ -6,7 +6,7 @@
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, DType, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
-use crate::error::{Error, Result};
+use crate::{Error, Result};
 
 /// x · sigmoid(x), any shape.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
@@ -295,7 +295,7 @@ mod tests {
     use candle_core::{Device, Var};
 
     use super::*;
-    use crate::rng::Stream;
+    use crate::random::Stream;
 
     #[test]
     fn sigmoid_is_exact_to_rounding_and_holds_far_out() {

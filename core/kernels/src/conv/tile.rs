@@ -2,7 +2,7 @@
 //! registers. Written once over [`Lanes`] and compiled for each instruction set that [`on`] can choose.
 
 use super::InstructionSet;
-use crate::kernels::simd::{Lanes, Portable};
+use crate::simd::{Lanes, Portable};
 
 /// Most rows that one product holds in registers.
 pub(super) const MOST_ROWS: usize = 8;
