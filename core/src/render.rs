@@ -11,6 +11,7 @@ use crate::{
 
 pub mod frame;
 pub mod integrate;
+pub mod plan;
 pub mod sampling;
 pub mod trajectory;
 
@@ -72,6 +73,13 @@ pub trait RadianceField {
     /// those weights `[B, 9, R]`, and view directions `[B, R, 3]`. Features are linear in activations, so this
     /// equals the weighted sum of the samples' features at a fraction of its cost.
     fn features(&self, activations: &Tensor, masks: &Tensor, view_directions: Option<&Tensor>) -> Result<Tensor>;
+
+    /// Portrait number `portrait` as plain numbers, for [`plan`]s; none where there are none to be had (another device
+    /// or number type).
+    fn local(&self, portrait: usize) -> Result<Option<plan::LocalField>> {
+        let _ = portrait;
+        Ok(None)
+    }
 
     /// The same field with no way back to its weights and codes: what is rendered from it holds no graph in memory.
     #[must_use]

@@ -237,7 +237,8 @@ fn off_views(camera: &Camera, turn_rad: f64) -> [Camera; 2] {
 }
 
 fn depth(generator: &Generator, codes: &Tensor, camera: &Tensor) -> Result<Tensor> {
-    let settings = RenderSettings { features: false, normals: false, ..generator.render_settings() };
+    // Exact, as the samples of `Tune::depth_loss` are: drift must not count what a plan leaves out.
+    let settings = RenderSettings { features: false, normals: false, budget: 0.0, ..generator.render_settings() };
     Ok(generator.render(codes, camera, &settings)?.depth.detach())
 }
 

@@ -261,6 +261,44 @@ fn results_are_the_same_bits_at_any_thread_count() {
     }
 }
 
+/// Regions prepared for lists give, for points in any order and company, the bits that whole evaluations give.
+#[test]
+fn prepared_regions_give_the_same_bits() {
+    for variant in 0..8 {
+        let extent = Extent { images: 1, regions: 3, points: 120 };
+        let case = Case::new(head_shape(20, variant), ALL, extent, 40 + variant as u64);
+        let single = |values: &[f64]| values.iter().map(|value| *value as f32).collect::<Vec<f32>>();
+        let (points, weights, film) = (single(&case.points), single(&case.weights), single(&case.film));
+        let (columns, parameters) = (case.shape.point_columns(), case.shape.parameter_count());
+        let picked: Vec<usize> = (0..extent.points).rev().filter(|index| index % 3 != 1).collect();
+        let list: Vec<f32> = picked.iter().flat_map(|index| points[index * columns..][..columns].to_vec()).collect();
+        for outputs in [Outputs::default(), Outputs { gradient: false, ..ALL }, ALL] {
+            let evaluation = Evaluation::new(case.shape, outputs, extent, &points, &weights, &film).unwrap();
+            for kernel in kernels().filter(|kernel| kernel.available()) {
+                let mut whole = vec![0f32; evaluation.result_len()];
+                kernel.forward(&evaluation, &mut whole).unwrap();
+                for region in 0..extent.regions {
+                    let (weights, film) = (&weights[region * parameters..][..parameters], film.chunks(10 * 20));
+                    let film = film.into_iter().nth(region).unwrap();
+                    let prepared = kernel.prepare(case.shape, outputs, weights, film).unwrap();
+                    let rows = prepared.rows().count;
+                    let mut found = vec![0f32; rows * picked.len()];
+                    prepared.forward(&list, &mut found).unwrap();
+                    for row in 0..rows {
+                        for (place, index) in picked.iter().enumerate() {
+                            let expected = whole[(region * rows + row) * extent.points + index];
+                            let found = found[place * rows + row];
+                            assert_eq!(found.to_bits(), expected.to_bits(), "{} {case} row {row}", kernel.name());
+                        }
+                    }
+                    assert!(prepared.forward(&list[1..], &mut found).is_err() || columns == 1);
+                    assert!(kernel.prepare(case.shape, outputs, &weights[1..], film).is_err());
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn chunked_points_agree_with_the_reference() {
     let extent = Extent { images: 1, regions: 2, points: 5003 };

@@ -10,10 +10,14 @@ use rayon::prelude::*;
 
 use self::{
     products::TILE,
-    region::{Aligned, FoldedLayout, GradientLayout, PackedRegion, Plan, film_len, fold, unfold},
+    region::{Aligned, AngleBounds, FoldedLayout, GradientLayout, PackedRegion, Plan, film_len, fold, unfold},
     tile::{ResultRows, Tile, TileGradients},
 };
-use super::{Evaluation, Extent, Gradients, RegionKernel, check_length, simd::Lanes};
+use super::{
+    Evaluation, Extent, Gradients, HeadShape, Outputs, PreparedRegion, RegionKernel, check_length,
+    prepared::{check_list, check_region},
+    simd::Lanes,
+};
 use crate::{Error, Result};
 
 mod products;
@@ -33,6 +37,34 @@ pub struct Fused {
     available: fn() -> bool,
     forward: unsafe fn(&mut Scratch, &Piece<'_>, Shared),
     backward: unsafe fn(&mut Scratch, &Piece<'_>, &[f32], &mut [f32], Shared),
+    fold: unsafe fn(&Plan, &PackedRegion, &[f32], &[f32], &mut Aligned) -> AngleBounds,
+    forward_list: unsafe fn(&mut Scratch, &Folded, &[f32], &mut [f32]),
+}
+
+/// One region of one image with FiLM folded in, see [`PreparedRegion`].
+struct Folded {
+    plan: Plan,
+    layout: FoldedLayout,
+    folded: Aligned,
+    bounds: AngleBounds,
+    forward_list: unsafe fn(&mut Scratch, &Folded, &[f32], &mut [f32]),
+}
+
+impl PreparedRegion<f32> for Folded {
+    fn shape(&self) -> HeadShape {
+        self.plan.shape
+    }
+
+    fn outputs(&self) -> Outputs {
+        self.plan.outputs
+    }
+
+    fn forward(&self, points: &[f32], result: &mut [f32]) -> Result<()> {
+        check_list(self.plan.shape, self.plan.rows.count, points, result.len())?;
+        // SAFETY: `prepare` found the instructions; the lengths were just checked.
+        SCRATCH.with_borrow_mut(|scratch| unsafe { (self.forward_list)(scratch, self, points, result) });
+        Ok(())
+    }
 }
 
 /// Where many threads write, each its own places.
@@ -80,7 +112,7 @@ impl<'a> Piece<'a> {
         let stride = self.evaluation.extent.points;
         let start = self.pair * self.plan.rows.count * stride + first;
         // SAFETY: within the result, whose length was checked.
-        ResultRows { start: unsafe { result.0.add(start) }, stride }
+        ResultRows { start: unsafe { result.0.add(start) }, stride, point_stride: 1 }
     }
 }
 
@@ -110,6 +142,31 @@ unsafe fn forward_piece<V: Lanes, const ROWS: usize>(scratch: &mut Scratch, piec
         let tile = Tile { plan: piece.plan, layout: &layout, folded, bounds, room };
         for (first, points) in piece.tiles() {
             tile.forward::<V, ROWS>(points, piece.rows(result, first));
+        }
+    }
+}
+
+/// # Safety
+/// The processor has V's instructions; `result` has C values for every point.
+#[inline(always)]
+unsafe fn forward_list<V: Lanes, const ROWS: usize>(
+    scratch: &mut Scratch,
+    region: &Folded,
+    points: &[f32],
+    result: &mut [f32],
+) {
+    let plan = &region.plan;
+    let columns = plan.shape.point_columns();
+    let point_stride = plan.rows.count;
+    scratch.room.grow(Tile::room_len(plan));
+    let room = scratch.room.as_mut_ptr();
+    let tile = Tile { plan, layout: &region.layout, folded: region.folded.as_ptr(), bounds: region.bounds, room };
+    for (index, points) in points.chunks(TILE * columns).enumerate() {
+        // SAFETY: the caller's promise; the room was grown to its layout.
+        unsafe {
+            let start = result.as_mut_ptr().add(index * TILE * point_stride);
+            let rows = ResultRows { start, stride: 1, point_stride };
+            tile.forward::<V, ROWS>(points, rows);
         }
     }
 }
@@ -155,10 +212,17 @@ macro_rules! instruction_set {
     ($kernel:ident, $module:ident, $name:literal, $lanes:ty, $rows:literal, $available:expr $(, $features:literal)?) => {
         #[doc = concat!("The fused kernel `", $name, "`.")]
         pub static $kernel: Fused =
-            Fused { name: $name, available: || $available, forward: $module::forward, backward: $module::backward };
+            Fused {
+                name: $name,
+                available: || $available,
+                forward: $module::forward,
+                backward: $module::backward,
+                fold: $module::fold,
+                forward_list: $module::forward_list,
+            };
 
         mod $module {
-            use super::{Piece, Scratch, Shared};
+            use super::{Aligned, AngleBounds, Folded, PackedRegion, Piece, Plan, Scratch, Shared};
 
             /// # Safety
             /// As [`super::forward_piece`].
@@ -180,6 +244,28 @@ macro_rules! instruction_set {
             ) {
                 // SAFETY: this function's own features, the caller's promise.
                 unsafe { super::backward_piece::<$lanes, $rows>(scratch, piece, upstream, partial, points) }
+            }
+
+            /// # Safety
+            /// As [`super::fold`].
+            $(#[target_feature(enable = $features)])?
+            pub unsafe fn fold(
+                plan: &Plan,
+                packed: &PackedRegion,
+                weights: &[f32],
+                film: &[f32],
+                folded: &mut Aligned,
+            ) -> AngleBounds {
+                // SAFETY: this function's own features, the caller's promise.
+                unsafe { super::fold::<$lanes>(plan, packed, weights, film, folded, !plan.sweeps.is_empty()) }
+            }
+
+            /// # Safety
+            /// As [`super::forward_list`].
+            $(#[target_feature(enable = $features)])?
+            pub unsafe fn forward_list(scratch: &mut Scratch, region: &Folded, points: &[f32], result: &mut [f32]) {
+                // SAFETY: this function's own features, the caller's promise.
+                unsafe { super::forward_list::<$lanes, $rows>(scratch, region, points, result) }
             }
         }
     };
@@ -297,6 +383,24 @@ impl RegionKernel<f32> for Fused {
             });
         }
         Ok(())
+    }
+
+    fn prepare(
+        &self,
+        shape: HeadShape,
+        outputs: Outputs,
+        weights: &[f32],
+        film: &[f32],
+    ) -> Result<Box<dyn PreparedRegion<f32>>> {
+        self.check()?;
+        check_region(shape, weights, film)?;
+        let plan = Plan::new(shape, outputs);
+        let packed = PackedRegion::new(&plan, weights);
+        let mut folded = Aligned::default();
+        // SAFETY: `check` found the instructions; the slices are one region's.
+        let bounds = unsafe { (self.fold)(&plan, &packed, weights, film, &mut folded) };
+        let layout = FoldedLayout::new(&plan);
+        Ok(Box::new(Folded { plan, layout, folded, bounds, forward_list: self.forward_list }))
     }
 }
 

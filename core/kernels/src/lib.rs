@@ -3,7 +3,7 @@
 //! A local generator is five FiLM-SIREN layers with three heads (paper, "Local generators"):
 //! h_l = sin(γ_l ∘ (W_l h_{l-1} + b_l) + β_l) with h_0 the point; the mask reads h_3, the residual distance h_3 or h_5
 //! ([`SdfHead`]), the colour h_5. [`autograd::evaluate`] is the door: a differentiable candle function over whichever
-//! [`RegionKernel`] the processor runs best. [`plain`] is the reference anybody can check, [`composed`] the same in
+//! [`RegionKernel`] the processor runs best; [`prepared`] the way in for renderers that leave most of the work out. [`plain`] is the reference anybody can check, [`composed`] the same in
 //! candle operations for other devices, [`fused`] the fast one.
 
 use std::{ops::Range, sync::OnceLock};
@@ -22,9 +22,11 @@ pub mod composed;
 pub mod conv;
 pub mod fused;
 pub mod plain;
+pub mod prepared;
 pub mod simd;
 
 pub use error::{Error, Result};
+pub use prepared::PreparedRegion;
 
 /// Which branch of a local generator carries the residual distance head.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -284,6 +286,18 @@ pub trait RegionKernel<T>: Send + Sync {
     /// # Errors
     /// If a slice has another length or the processor cannot run this kernel.
     fn backward(&self, evaluation: &Evaluation<'_, T>, upstream: &[T], gradients: Gradients<'_, T>) -> Result<()>;
+
+    /// One region of one image, `weights` [P] and `film` [5, 2, W], made ready for lists of points.
+    ///
+    /// # Errors
+    /// If a slice has another length or the processor cannot run this kernel.
+    fn prepare(
+        &self,
+        shape: HeadShape,
+        outputs: Outputs,
+        weights: &[T],
+        film: &[T],
+    ) -> Result<Box<dyn PreparedRegion<T>>>;
 }
 
 /// Every kernel, the fastest first; whether the processor can run one is for [`RegionKernel::available`] to say.

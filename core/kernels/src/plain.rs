@@ -3,12 +3,15 @@
 
 use std::ops::{Add, AddAssign, Mul, Sub};
 
-use super::{Evaluation, Gradients, HeadShape, Layout, Linear, RegionKernel, Rows, check_length};
+use super::{
+    Evaluation, Gradients, HeadShape, Layout, Linear, Outputs, PreparedRegion, RegionKernel, Rows, check_length,
+    prepared::PlainRegion,
+};
 use crate::{FILM_LAYERS, Result, SHAPE_LAYERS};
 
 /// A floating-point number: f32 or f64.
 pub trait Real:
-    Copy + Default + Send + Sync + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + AddAssign
+    Copy + Default + Send + Sync + 'static + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + AddAssign
 {
     /// Sine of an angle in radians.
     fn sin(self) -> Self;
@@ -94,6 +97,16 @@ impl<T: Real> RegionKernel<T> for Plain {
             generator.unfold(&folded, weights, &mut gradients.film[pair * film_len..][..film_len]);
         }
         Ok(())
+    }
+
+    fn prepare(
+        &self,
+        shape: HeadShape,
+        outputs: Outputs,
+        weights: &[T],
+        film: &[T],
+    ) -> Result<Box<dyn PreparedRegion<T>>> {
+        Ok(Box::new(PlainRegion::new(shape, outputs, weights, film)?))
     }
 }
 

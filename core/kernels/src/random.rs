@@ -36,6 +36,11 @@ impl Stream {
         self.0.random_range(0..count)
     }
 
+    /// One of `choices`; none if there are none.
+    pub fn pick<'a, T>(&mut self, choices: &'a [T]) -> Option<&'a T> {
+        if choices.is_empty() { None } else { choices.get(self.below(choices.len())) }
+    }
+
     /// Standard normal, by Box-Muller in f64.
     pub fn normal(&mut self) -> f32 {
         let radius = (-2.0 * (1.0 - self.0.random::<f64>()).ln()).sqrt();

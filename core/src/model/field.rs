@@ -4,7 +4,7 @@
 //! A [`Field`] holds weights. Codes turn it into a [`PortraitField`], which answers for points of space: the local
 //! generators' raw outputs come from the kernels, this file fuses them.
 
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 use candle_nn::ops::sigmoid;
 
 use crate::{
@@ -18,7 +18,10 @@ use crate::{
     kernels::{HeadShape, Outputs, autograd},
     parameters::{Init, Parameters},
     region::{REGION_COUNT, RegionSet},
-    render::{BackgroundEvaluation, Evaluation, RadianceField, norm},
+    render::{
+        BackgroundEvaluation, Evaluation, RadianceField, norm,
+        plan::{LocalField, LocalInitial, LocalWeights},
+    },
 };
 
 /// FiLM-SIREN layers and residual heads of `k` local generators, weights stacked over them.
@@ -252,6 +255,12 @@ impl Kernel {
         Ok(autograd::evaluate(&inputs, &self.weights, &self.film, self.shape, outputs)?)
     }
 
+    fn local(&self, portrait: usize) -> Result<LocalWeights> {
+        let values = |tensor: &Tensor| -> Result<Vec<f32>> { Ok(tensor.flatten_all()?.to_vec1()?) };
+        let film = values(&self.film.narrow(0, portrait, 1)?)?;
+        Ok(LocalWeights { shape: self.shape, weights: values(&self.weights)?, film })
+    }
+
     fn detached(&self) -> Self {
         Self { shape: self.shape, weights: self.weights.detach(), film: self.film.detach() }
     }
@@ -448,6 +457,29 @@ impl RadianceField for PortraitField {
         let weight = weight.transpose(0, 1)?.reshape((1, features, regions * columns))?;
         let weight = weight.broadcast_as((batch, features, regions * columns))?.contiguous()?;
         Ok(weight.matmul(&inputs.reshape((batch, regions * columns, rays))?)?)
+    }
+
+    fn local(&self, portrait: usize) -> Result<Option<LocalField>> {
+        let plain = |kernel: &Kernel| kernel.weights.device().is_cpu() && kernel.weights.dtype() == DType::F32;
+        if !plain(&self.volume) {
+            return Ok(None);
+        }
+        Ok(Some(LocalField {
+            volume: self.volume_regions(),
+            generators: self.volume.local(portrait)?,
+            background: self.background.as_ref().map(|kernel| kernel.local(portrait)).transpose()?,
+            initial: match (self.config.density, &self.initial, self.config.initial_distance) {
+                (DensityKind::Sdf | DensityKind::Density, _, _) => LocalInitial::None,
+                (DensityKind::ResidualSdf, Some(network), _) => LocalInitial::Network(network.local(portrait)?),
+                (DensityKind::ResidualSdf, None, InitialDistance::Sphere { radius }) => LocalInitial::Sphere { radius },
+                (DensityKind::ResidualSdf, None, InitialDistance::Network) => return Ok(None),
+            },
+            fusion: self.config.fusion,
+            residual: self.config.residual,
+            residual_scale: self.config.residual_scale,
+            density: self.config.density,
+            inverse_alpha: bounded(&self.log_alpha)?.neg()?.exp()?.squeeze(0)?.to_scalar::<f32>()?,
+        }))
     }
 
     fn detached(&self) -> Self {

@@ -42,6 +42,8 @@ pub struct Generator {
     /// Mean w, `[D]`.
     w_mean: Tensor,
     header: Option<ModelHeader>,
+    /// See [`Self::with_budget`].
+    budget: f64,
 }
 
 /// A finished picture and the render under it.
@@ -77,7 +79,15 @@ impl Generator {
             z_statistics: (statistic("z_mean", 0.0)?, statistic("z_deviation", 1.0)?),
             w_mean: statistic("w_mean", 0.0)?,
             header: None,
+            budget: 0.0,
         })
+    }
+
+    /// The same generator whose [`Self::render_settings`] allow pictures this error, in [0, 1] colour units (see
+    /// [`crate::render::plan`]). Generators start exact, with 0; copies keep what the original has.
+    #[must_use]
+    pub fn with_budget(self, budget: f64) -> Self {
+        Self { budget, ..self }
     }
 
     /// The model file at `path`.
@@ -104,7 +114,7 @@ impl Generator {
     /// A generator with weights of its own: changing one leaves the other as it is.
     pub fn duplicate(&self) -> Result<Self> {
         let copy = Self::from_tensors(&self.config, self.parameters.snapshot()?, &self.parameters.device())?;
-        Ok(Self { header: self.header.clone(), ..copy })
+        Ok(Self { header: self.header.clone(), budget: self.budget, ..copy })
     }
 
     /// The same weights with another upsampler: none, or a fresh one drawn from `seed`.
@@ -222,7 +232,8 @@ impl Generator {
         set("w_mean", &w.mean(0)?)
     }
 
-    /// Settings a render for the upsampler needs: its input resolution, features, and normals if it reads them.
+    /// Settings a render for the upsampler needs: its input resolution, features, and normals if it reads them; and the
+    /// generator's budget.
     pub fn render_settings(&self) -> RenderSettings {
         let sampling = match self.config.field.background {
             Background::FarPlane => Sampling::behind_the_surface(self.config.samples),
@@ -233,6 +244,7 @@ impl Generator {
             sampling,
             features: self.upsampler.is_some(),
             normals: self.config.upsampler.as_ref().is_some_and(|upsampler| upsampler.normal_input),
+            budget: self.budget,
             ..RenderSettings::default()
         }
     }

@@ -7,7 +7,9 @@ use crate::{
     camera::{self, pixel_centres},
     error::{Error, Result},
     region::RegionSet,
-    render::{Outputs, Placement, RadianceField, RayBundle, RayOutput, RayWeights, Sampling, integrate::aggregate},
+    render::{
+        Outputs, Placement, RadianceField, RayBundle, RayOutput, RayWeights, Sampling, integrate::aggregate, plan,
+    },
     rng::Stream,
 };
 
@@ -33,6 +35,9 @@ pub struct RenderSettings {
     pub normals: bool,
     /// Keep the graph, to differentiate the picture: memory then grows with rays x samples.
     pub differentiable: bool,
+    /// How far colours may be from those of the exhaustive path, in [0, 1] colour units; 0 evaluates every region at
+    /// every sample. See [`plan`].
+    pub budget: f64,
 }
 
 impl Default for RenderSettings {
@@ -47,7 +52,21 @@ impl Default for RenderSettings {
             features: false,
             normals: false,
             differentiable: false,
+            budget: 0.0,
         }
+    }
+}
+
+impl RenderSettings {
+    /// Refuses settings that no picture can have.
+    pub fn validate(&self) -> Result<()> {
+        if self.resolution == 0 {
+            return Err(Error::config("resolution", "must be at least 1"));
+        }
+        if !(self.budget >= 0.0 && self.budget.is_finite()) {
+            return Err(Error::config("budget", format!("{} is not a number of at least 0", self.budget)));
+        }
+        self.sampling.validate()
     }
 }
 
@@ -90,22 +109,37 @@ pub struct Frame {
 /// Points evaluated at once for pictures that nobody differentiates: about 200 MB of activations at width 128.
 const POINTS_AT_ONCE: usize = 1 << 14;
 
-/// Pictures of `field` from `cameras` `[B, 6]` (see [`camera::Camera::parameters`]).
+/// Pictures of `field` from `cameras` `[B, 6]` (see [`camera::Camera::parameters`]); [`plan::render`] without its report.
 pub fn render_frame<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Frame> {
+    Ok(plan::render(field, cameras, settings)?.frame)
+}
+
+/// The rays of all pixels in row order, and the depths of their samples, `[B, R, S]` (or 1 in place of B and R).
+pub(super) fn rays(cameras: &Tensor, settings: &RenderSettings) -> Result<(RayBundle, Tensor)> {
+    settings.validate()?;
     let (batch, resolution) = (cameras.dim(0)?, settings.resolution);
-    if resolution == 0 {
-        return Err(Error::config("resolution", "must be at least 1"));
-    }
     let pixels = pixel_centres(resolution, cameras.device())?.to_dtype(cameras.dtype())?;
     let rays = RayBundle::new(camera::cast(cameras, &pixels, resolution, settings.field_of_view_rad)?)?;
-    let count = resolution * resolution;
     let depths = match settings.perturb {
         Some(seed) => {
             let mut random = Stream::new(seed, &[]);
+            let count = resolution * resolution;
             settings.sampling.perturbed(batch, count, &mut random, cameras.dtype(), cameras.device())?
         }
         None => settings.sampling.regular(cameras.dtype(), cameras.device())?,
     };
+    Ok((rays, depths))
+}
+
+/// Every region at every sample.
+pub(super) fn render_exhaustively<F: RadianceField>(
+    field: &F,
+    cameras: &Tensor,
+    settings: &RenderSettings,
+) -> Result<Frame> {
+    let (batch, resolution) = (cameras.dim(0)?, settings.resolution);
+    let (rays, depths) = rays(cameras, settings)?;
+    let count = resolution * resolution;
     let chunk = if settings.differentiable {
         count
     } else {
@@ -205,9 +239,6 @@ fn render_rays_in_two_passes<F: RadianceField>(
     outputs: Outputs,
     shown: RegionSet,
 ) -> Result<RayOutput> {
-    if two_pass.bins == 0 || two_pass.colour_samples == 0 {
-        return Err(Error::config("two_pass", "bins and colour_samples must be at least 1"));
-    }
     if settings.differentiable {
         return Err(Error::config("two_pass", "quantiles have no gradient; render differentiable pictures without it"));
     }
@@ -217,12 +248,7 @@ fn render_rays_in_two_passes<F: RadianceField>(
     let coarse = field.evaluate(&rays.points(depths)?, view.as_ref(), Outputs::default())?;
     let distance = coarse.distance.reshape((batch, count, samples))?;
 
-    let fine = Sampling {
-        placement: Placement::Stratified,
-        samples: two_pass.bins,
-        last_interval: settings.sampling.last_interval.map(|_| settings.sampling.interval_of(two_pass.bins)),
-        ..settings.sampling
-    };
+    let fine = fine_bins(&settings.sampling, two_pass)?;
     let bins = fine.regular(dtype, device)?;
     let distance = interpolate(&distance, depths, &bins)?;
     let lengths = fine.intervals(&bins)?.broadcast_mul(&rays.lengths()?.unsqueeze(2)?)?;
@@ -236,6 +262,19 @@ fn render_rays_in_two_passes<F: RadianceField>(
     let weights = RayWeights { weights, remaining: light.remaining };
     let background = background(field, rays, outputs)?;
     aggregate(field, rays, &depths, weights, evaluation, background.as_ref(), shown)
+}
+
+/// The bins of two passes over the range of `sampling`.
+pub(super) fn fine_bins(sampling: &Sampling, two_pass: &TwoPass) -> Result<Sampling> {
+    if two_pass.bins == 0 || two_pass.colour_samples == 0 {
+        return Err(Error::config("two_pass", "bins and colour_samples must be at least 1"));
+    }
+    Ok(Sampling {
+        placement: Placement::Stratified,
+        samples: two_pass.bins,
+        last_interval: sampling.last_interval.map(|_| sampling.interval_of(two_pass.bins)),
+        ..*sampling
+    })
 }
 
 /// `values` `[B, R, S]` at increasing `depths` `[B, R, S]` (or 1s), read at `targets` `[1, 1, T]` by straight lines,
@@ -270,23 +309,28 @@ fn quantiles(weights: &Tensor, bins: &Sampling, count: usize) -> Result<Tensor> 
     let (batch, rays, _) = weights.dims3()?;
     let mut depths = Vec::with_capacity(batch * rays * count);
     for light in rows(weights, bins.samples)? {
-        // A trace of light everywhere spreads the samples of rays that meet nothing.
-        let total: f64 = light.iter().map(|weight| weight + 1e-6).sum();
-        let mut bin = 0;
-        let mut passed = 0.0;
-        for share in 0..count {
-            let wanted = (share as f64 + 0.5) / count as f64 * total;
-            let mut here = light.get(bin).map_or(0.0, |weight| weight + 1e-6);
-            while passed + here < wanted && bin + 1 < bins.samples {
-                passed += here;
-                bin += 1;
-                here = light.get(bin).map_or(0.0, |weight| weight + 1e-6);
-            }
-            let within = ((wanted - passed) / here.max(1e-9)).clamp(0.0, 1.0);
-            depths.push(bins.near + bins.interval() * (bin as f64 + within));
-        }
+        depths.extend(quantiles_of_ray(&light, bins, count));
     }
     like(depths, (batch, rays, count), weights)
+}
+
+/// [`quantiles`] of one ray, from the light of each bin.
+pub(super) fn quantiles_of_ray(light: &[f64], bins: &Sampling, count: usize) -> impl Iterator<Item = f64> {
+    // A trace of light everywhere spreads the samples of rays that meet nothing.
+    const TRACE: f64 = 1e-6;
+    let total: f64 = light.iter().map(|weight| weight + TRACE).sum();
+    let (near, interval) = (bins.near, bins.interval());
+    let (mut bin, mut passed) = (0, 0.0);
+    (0..count).map(move |share| {
+        let wanted = (share as f64 + 0.5) / count as f64 * total;
+        let here = |bin: usize| light.get(bin).map_or(0.0, |weight| weight + TRACE);
+        while passed + here(bin) < wanted && bin + 1 < light.len() {
+            passed += here(bin);
+            bin += 1;
+        }
+        let within = ((wanted - passed) / here(bin).max(1e-9)).clamp(0.0, 1.0);
+        near + interval * (bin as f64 + within)
+    })
 }
 
 fn rows(tensor: &Tensor, length: usize) -> Result<Vec<Vec<f64>>> {

@@ -39,6 +39,7 @@ pub struct Sweep {
 #[derive(Clone, Debug)]
 pub struct Plan {
     pub shape: HeadShape,
+    pub outputs: Outputs,
     pub layout: Layout,
     pub rows: Rows,
     /// Layers needed.
@@ -73,6 +74,7 @@ impl Plan {
         sweeps.extend(residual.map(|rows| Sweep { head: 1, depth: residual_depth, row: rows.start }));
         Self {
             shape,
+            outputs,
             rows,
             depth,
             padded: shape.width.next_multiple_of(PADDING),

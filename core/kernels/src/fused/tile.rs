@@ -37,11 +37,13 @@ pub struct Tile<'a> {
     pub room: *mut f32,
 }
 
-/// Rows of a result or its upstream gradient: row r of point p is at `start + r · stride + p`.
+/// Rows of a result or its upstream gradient: row r of point p is at `start + r · stride + p · point_stride`.
 #[derive(Clone, Copy)]
 pub struct ResultRows {
     pub start: *mut f32,
     pub stride: usize,
+    /// 1, or the number of rows with a `stride` of 1.
+    pub point_stride: usize,
 }
 
 /// Where a backward pass adds or leaves gradients.
@@ -239,10 +241,19 @@ impl Tile<'_> {
                 }
             }
             if let Some(activations) = &plan.rows.activations {
-                for column in 0..plan.shape.width {
-                    let target = result.start.add((activations.start + column) * result.stride);
+                let target = result.start.add(activations.start * result.stride);
+                if result.stride == 1 {
                     for point in 0..count {
-                        *target.add(point) = *input.add(point * plan.padded + column);
+                        let (source, target) =
+                            (input.add(point * plan.padded), target.add(point * result.point_stride));
+                        std::ptr::copy_nonoverlapping(source, target, plan.shape.width);
+                    }
+                } else {
+                    for column in 0..plan.shape.width {
+                        let target = target.add(column * result.stride);
+                        for point in 0..count {
+                            *target.add(point * result.point_stride) = *input.add(point * plan.padded + column);
+                        }
                     }
                 }
             }
@@ -252,7 +263,16 @@ impl Tile<'_> {
     #[inline(always)]
     unsafe fn emit(&self, count: usize, result: ResultRows, row: usize) {
         // SAFETY: the result has `count` points from `start` in every row.
-        unsafe { std::ptr::copy_nonoverlapping(self.line(), result.start.add(row * result.stride), count) }
+        unsafe {
+            let target = result.start.add(row * result.stride);
+            if result.point_stride == 1 {
+                std::ptr::copy_nonoverlapping(self.line(), target, count);
+            } else {
+                for point in 0..count {
+                    *target.add(point * result.point_stride) = *self.line().add(point);
+                }
+            }
+        }
     }
 
     /// The reverse sweep of a head down to u_0 in `after(0)`; `keep`: leaves v_l in `before(l)` for all l below the head.
@@ -358,6 +378,7 @@ impl Tile<'_> {
     #[inline(always)]
     unsafe fn load_upstream(&self, count: usize, upstream: ResultRows) {
         let plan = self.plan;
+        debug_assert_eq!(upstream.point_stride, 1);
         // SAFETY: `upstream` has `count` points from `start` in every row; the targets hold TILE each.
         unsafe {
             let load = |row: usize, target: *mut f32| {

@@ -1,0 +1,394 @@
+//! A coarse grid of one portrait's distance and masks over the volume, shared by all frames of a sequence.
+//!
+//! Between vertices values are interpolated; how far they may be off, and which regions matter in a cell, is ESTIMATED
+//! from the vertices with a safety factor, not proven: intervals pushed through three sine layers whose angles change by
+//! several radians across a cell cover [-1, 1], so proven bounds say nothing at cells that are affordable (see the
+//! test `proven_bounds_of_a_cell_say_nothing_at_affordable_sizes`).
+
+use rayon::prelude::*;
+
+use crate::{
+    config::{Fusion, Residual},
+    error::Result,
+    region::REGION_COUNT,
+    render::plan::local::{Ready, scaled},
+};
+
+/// Cells along the longest side. A head of 0.06 units' radius is then some twenty cells across.
+const CELLS: usize = 56;
+/// What estimates from the vertices are multiplied by.
+pub const SAFETY: f32 = 2.0;
+/// Vertices evaluated at once.
+const VERTICES_AT_ONCE: usize = 4096;
+/// Largest o exp(-o): a sample's share changes by at most this for each unit of relative change of its optical depth.
+const STEEPEST_SHARE: f32 = 0.37;
+
+/// The grid.
+pub struct Grid {
+    low: [f32; 3],
+    cell: f32,
+    cells: [usize; 3],
+    regions: usize,
+    /// Signed distances at the vertices, world units.
+    distances: Vec<f32>,
+    /// Fused masks at the vertices, `[V, k]`.
+    masks: Vec<f32>,
+    /// Per cell.
+    estimates: Vec<CellEstimate>,
+}
+
+/// What is estimated of a cell.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CellEstimate {
+    /// How far interpolated distances may be off, world units.
+    pub distance: f32,
+    /// How far colours fused with interpolated masks may be off, [0, 1] colour units.
+    pub masks: f32,
+    /// What leaving out all but the relevant regions may change, [0, 1] colour units.
+    pub left_out: f32,
+    /// The regions that matter here, as bits.
+    pub relevant: u16,
+}
+
+/// Where a point lies in the grid.
+#[derive(Clone, Copy)]
+pub struct Place {
+    cell: usize,
+    vertex: usize,
+    fraction: [f32; 3],
+}
+
+/// A vertex's values.
+struct Vertices {
+    distances: Vec<f32>,
+    masks: Vec<f32>,
+    /// What leaving out each region would change, [0, 1] colour units, `[V, k]`.
+    charges: Vec<f32>,
+}
+
+impl Grid {
+    /// The grid of `field`, which has no initial network and no masks that see the view, over the box `low .. high`, world. In each cell regions are left out whose effects sum to at
+    /// most `negligible`, [0, 1] colour units.
+    pub fn new(field: &Ready, low: [f32; 3], high: [f32; 3], negligible: f32) -> Result<Self> {
+        let extent: [f32; 3] = std::array::from_fn(|axis| (high[axis] - low[axis]).max(1e-6));
+        let cell = extent.iter().fold(0f32, |longest, side| longest.max(*side)) / CELLS as f32;
+        let cells = extent.map(|side| ((side / cell).ceil() as usize).clamp(1, CELLS));
+        let mut grid = Self {
+            low,
+            cell,
+            cells,
+            regions: field.regions.len(),
+            distances: Vec::new(),
+            masks: Vec::new(),
+            estimates: Vec::new(),
+        };
+        let vertices = grid.vertices(field)?;
+        (grid.distances, grid.masks) = (vertices.distances, vertices.masks);
+        grid.estimates = grid.estimate(field, &vertices.charges, negligible);
+        Ok(grid)
+    }
+
+    /// Shape branches that were run for it: one a vertex and region.
+    pub fn pairs(&self) -> usize {
+        self.distances.len() * self.regions
+    }
+
+    /// Values kept.
+    pub fn memory(&self) -> usize {
+        size_of::<f32>() * (self.distances.len() + self.masks.len()) + size_of_val(&self.estimates[..])
+    }
+
+    /// Where a world point lies; none outside of the grid.
+    pub fn place(&self, point: [f32; 3]) -> Option<Place> {
+        let mut fraction = [0.0; 3];
+        let mut index = [0; 3];
+        for axis in 0..3 {
+            let position = (point[axis] - self.low[axis]) / self.cell;
+            let cells = self.cells[axis] as f32;
+            // Rounding may put the outermost samples just outside.
+            if !(-1e-3..=cells + 1e-3).contains(&position) {
+                return None;
+            }
+            index[axis] = (position.max(0.0) as usize).min(self.cells[axis] - 1);
+            fraction[axis] = position - index[axis] as f32;
+        }
+        let cell = (index[2] * self.cells[1] + index[1]) * self.cells[0] + index[0];
+        Some(Place { cell, vertex: self.vertex(index), fraction })
+    }
+
+    /// The signed distance, interpolated, world units.
+    pub fn distance(&self, place: Place) -> f32 {
+        self.corners(place).map(|(vertex, share)| share * self.distances[vertex]).sum()
+    }
+
+    /// Masks, interpolated.
+    pub fn masks(&self, place: Place, masks: &mut [f32]) {
+        masks.fill(0.0);
+        for (vertex, share) in self.corners(place) {
+            for (mask, value) in masks.iter_mut().zip(&self.masks[vertex * self.regions..]) {
+                *mask += share * value;
+            }
+        }
+    }
+
+    pub fn estimate_at(&self, place: Place) -> &CellEstimate {
+        &self.estimates[place.cell]
+    }
+
+    fn vertex(&self, index: [usize; 3]) -> usize {
+        (index[2] * (self.cells[1] + 1) + index[1]) * (self.cells[0] + 1) + index[0]
+    }
+
+    /// Steps from a vertex to the next along each axis.
+    fn strides(&self) -> [usize; 3] {
+        let row = self.cells[0] + 1;
+        [1, row, row * (self.cells[1] + 1)]
+    }
+
+    /// The cell's vertices and their shares of its interpolation.
+    fn corners(&self, place: Place) -> impl Iterator<Item = (usize, f32)> {
+        let strides = self.strides();
+        (0..8).map(move |corner: usize| {
+            let (mut vertex, mut share) = (place.vertex, 1.0);
+            for axis in 0..3 {
+                if corner >> axis & 1 == 1 {
+                    vertex += strides[axis];
+                    share *= place.fraction[axis];
+                } else {
+                    share *= 1.0 - place.fraction[axis];
+                }
+            }
+            (vertex, share)
+        })
+    }
+
+    fn vertices(&self, field: &Ready) -> Result<Vertices> {
+        let (columns, regions) = (field.columns(), self.regions);
+        let counts = self.cells.map(|cells| cells + 1);
+        let total = counts.iter().product::<usize>();
+        let position = |vertex: usize| -> [f32; 3] {
+            let index = [vertex % counts[0], vertex / counts[0] % counts[1], vertex / (counts[0] * counts[1])];
+            std::array::from_fn(|axis| self.low[axis] + self.cell * index[axis] as f32)
+        };
+        let starts: Vec<usize> = (0..total).step_by(VERTICES_AT_ONCE).collect();
+        let blocks: Vec<Result<Vertices>> = starts
+            .into_par_iter()
+            .map(|start| {
+                let points: Vec<[f32; 3]> = (start..total.min(start + VERTICES_AT_ONCE)).map(position).collect();
+                let mut inputs = Vec::with_capacity(points.len() * columns);
+                for point in &points {
+                    inputs.extend(point.map(scaled));
+                    inputs.extend(std::iter::repeat_n(0.0, columns - 3));
+                }
+                let mut raw = vec![0.0; points.len() * regions * 2];
+                let mut values = vec![0.0; points.len() * 2];
+                for (region, shape) in field.shape.iter().enumerate() {
+                    shape.forward(&inputs, &mut values)?;
+                    for (point, values) in values.chunks_exact(2).enumerate() {
+                        raw[(point * regions + region) * 2..][..2].copy_from_slice(values);
+                    }
+                }
+                let mut block = Vertices { distances: Vec::new(), masks: Vec::new(), charges: Vec::new() };
+                for (point, raw) in points.iter().zip(raw.chunks_exact(regions * 2)) {
+                    block.push(field, *point, raw);
+                }
+                Ok(block)
+            })
+            .collect();
+        let mut all = Vertices { distances: Vec::new(), masks: Vec::new(), charges: Vec::new() };
+        for block in blocks {
+            let block = block?;
+            all.distances.extend(block.distances);
+            all.masks.extend(block.masks);
+            all.charges.extend(block.charges);
+        }
+        Ok(all)
+    }
+
+    fn estimate(&self, field: &Ready, charges: &[f32], negligible: f32) -> Vec<CellEstimate> {
+        let regions = self.regions;
+        let optional = matches!(field.local.fusion, Fusion::Softmax { .. }) && field.local.residual == Residual::Gated;
+        let every = ((1u32 << regions) - 1) as u16;
+        let slopes: Vec<f32> = field.ranges.iter().map(|range| range.largest_radius() / 4.0).collect();
+        // Per vertex, how far interpolation next to it may be off: distance and colour.
+        let bends: Vec<(f32, f32)> = (0..self.distances.len())
+            .into_par_iter()
+            .map(|vertex| {
+                let mut colour = 0.0;
+                for (region, slope) in slopes.iter().enumerate() {
+                    colour += slope * self.bend(vertex, |vertex| self.masks[vertex * regions + region]);
+                }
+                (self.bend(vertex, |vertex| self.distances[vertex]), colour)
+            })
+            .collect();
+        let counts = self.cells;
+        (0..counts.iter().product::<usize>())
+            .into_par_iter()
+            .map(|cell| {
+                let index = [cell % counts[0], cell / counts[0] % counts[1], cell / (counts[0] * counts[1])];
+                let place = Place { cell, vertex: self.vertex(index), fraction: [0.5; 3] };
+                let mut estimate = CellEstimate { relevant: every, ..CellEstimate::default() };
+                let mut largest = [0f32; REGION_COUNT];
+                for (vertex, _) in self.corners(place) {
+                    estimate.distance = estimate.distance.max(SAFETY * bends[vertex].0);
+                    estimate.masks = estimate.masks.max(SAFETY * bends[vertex].1).min(1.0);
+                    for (largest, charge) in largest.iter_mut().zip(&charges[vertex * regions..][..regions]) {
+                        *largest = largest.max(SAFETY * charge);
+                    }
+                }
+                let mut order: Vec<usize> = if optional { (0..regions).collect() } else { Vec::new() };
+                order.sort_by(|left, right| largest[*left].total_cmp(&largest[*right]));
+                for region in order {
+                    if estimate.left_out + largest[region] > negligible {
+                        break;
+                    }
+                    estimate.left_out += largest[region];
+                    estimate.relevant &= !(1 << region);
+                }
+                estimate
+            })
+            .collect()
+    }
+
+    /// Σ over the axes of |second difference| / 8: what linear interpolation of a smooth function is off by.
+    fn bend(&self, vertex: usize, value: impl Fn(usize) -> f32) -> f32 {
+        let counts = self.cells.map(|cells| cells + 1);
+        let index = [vertex % counts[0], vertex / counts[0] % counts[1], vertex / (counts[0] * counts[1])];
+        let mut sum = 0.0;
+        for (axis, stride) in self.strides().into_iter().enumerate() {
+            if counts[axis] < 3 {
+                continue;
+            }
+            // At the border, as one vertex further in.
+            let middle = match index[axis] {
+                0 => vertex + stride,
+                last if last + 1 == counts[axis] => vertex - stride,
+                _ => vertex,
+            };
+            sum += (value(middle - stride) - 2.0 * value(middle) + value(middle + stride)).abs() / 8.0;
+        }
+        sum
+    }
+}
+
+impl Vertices {
+    fn push(&mut self, field: &Ready, point: [f32; 3], raw: &[f32]) {
+        let regions = field.regions.len();
+        let mut masks = [0f32; REGION_COUNT];
+        let fused = field.fuse(raw, &mut masks[..regions]);
+        self.distances.push(field.distance(point, fused.residual, 0.0));
+        self.masks.extend(&masks[..regions]);
+        let scale = field.local.residual_scale as f32;
+        for (region, raw) in raw.chunks_exact(2).enumerate() {
+            let moved = (raw[1] * scale - fused.mean).abs() * field.local.inverse_alpha * STEEPEST_SHARE;
+            let coloured = field.ranges[region].largest_radius() / 4.0;
+            self.charges.push(masks[region] * (coloured + moved));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use candle_core::Device;
+
+    use super::*;
+    use crate::{
+        kernels::SHAPE_LAYERS,
+        model::generator::Generator,
+        render::{RadianceField as _, plan::LocalField},
+    };
+
+    fn built_in_portrait() -> LocalField {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/portrait.safetensors");
+        let generator = Generator::open(Path::new(path), &Device::Cpu).unwrap();
+        let codes = generator.codes_from_seed(3, 0.7).unwrap();
+        generator.field().portraits(&codes).unwrap().local(0).unwrap().unwrap()
+    }
+
+    /// Proven radii of a region's raw mask and residual over the ball-free box centre ± half (network units): an affine
+    /// form in the three coordinates is carried through the layers, sin(m + t) = sin m + t cos m ± t²/2 where that is
+    /// tighter than ± 1.
+    fn proven_radii(field: &LocalField, region: usize, centre: [f64; 3], half: f64) -> [f64; 2] {
+        let layout = field.generators.shape.layout();
+        let width = field.generators.shape.width;
+        let (weights, film) = field.generators.region(region);
+        let mut values: Vec<f64> = centre.to_vec();
+        let mut slopes: Vec<[f64; 3]> =
+            (0..3).map(|axis| std::array::from_fn(|other| f64::from(u8::from(other == axis)) * half)).collect();
+        let mut errors = vec![0f64; 3];
+        let affine = |row: &[f32], gamma: f64, offset: f64, values: &[f64], slopes: &[[f64; 3]], errors: &[f64]| {
+            let (mut value, mut slope, mut error) = (offset, [0f64; 3], 0f64);
+            for (input, weight) in row.iter().take(values.len()).enumerate() {
+                let weight = gamma * f64::from(*weight);
+                value += weight * values[input];
+                error += weight.abs() * errors[input];
+                for axis in 0..3 {
+                    slope[axis] += weight * slopes[input][axis];
+                }
+            }
+            (value, slope, error)
+        };
+        for layer in 0..SHAPE_LAYERS {
+            let linear = &layout.layers[layer];
+            let mut next = (Vec::new(), Vec::new(), Vec::new());
+            for unit in 0..width {
+                let gamma = f64::from(film[2 * layer * width + unit]);
+                let offset = gamma * f64::from(weights[linear.bias.start + unit])
+                    + f64::from(film[(2 * layer + 1) * width + unit]);
+                let row = &weights[linear.weight.start + unit * linear.inputs..][..linear.inputs];
+                let (value, slope, error) = affine(row, gamma, offset, &values, &slopes, &errors);
+                let radius = slope.iter().map(|slope| slope.abs()).sum::<f64>() + error;
+                let (sin, cos) = value.sin_cos();
+                if cos.abs() * radius + radius * radius / 2.0 < 1.0 {
+                    next.0.push(sin);
+                    next.1.push(slope.map(|slope| slope * cos));
+                    next.2.push(error * cos.abs() + radius * radius / 2.0);
+                } else {
+                    next.0.push(0.0);
+                    next.1.push([0.0; 3]);
+                    next.2.push(1.0);
+                }
+            }
+            (values, slopes, errors) = next;
+        }
+        [&layout.mask, &layout.residual].map(|head| {
+            let (_, slope, error) = affine(&weights[head.weight.clone()], 1.0, 0.0, &values, &slopes, &errors);
+            slope.iter().map(|slope| slope.abs()).sum::<f64>() + error
+        })
+    }
+
+    /// Median radii of the raw masks' logits (times the sharpness) and of Δd in world units.
+    fn median_radii(field: &LocalField, cell: f64) -> [f64; 2] {
+        let Fusion::Softmax { sharpness } = field.fusion else { panic!("the built-in model fuses by softmax") };
+        let mut radii: [Vec<f64>; 2] = Default::default();
+        for region in 0..8 {
+            for place in 0..20 {
+                let turn = f64::from(place) * 2.4;
+                let centre = [0.5 * turn.cos(), 0.5 * turn.sin(), 0.04 * f64::from(place) - 0.4];
+                let [mask, residual] = proven_radii(field, region, centre, cell / 2.0 * crate::camera::INPUT_SCALE);
+                radii[0].push(mask * sharpness);
+                radii[1].push(residual * field.residual_scale);
+            }
+        }
+        radii.map(|mut radii| {
+            radii.sort_by(f64::total_cmp);
+            radii[radii.len() / 2]
+        })
+    }
+
+    #[test]
+    fn proven_bounds_of_a_cell_say_nothing_at_affordable_sizes() {
+        let field = built_in_portrait();
+        for cells in [56.0, 128.0, 256.0, 512.0, 1024.0] {
+            let [logit, distance] = median_radii(&field, 0.3 / cells);
+            println!("{cells} cells a side: mask logits ± {logit:.3}, Δd ± {distance:.5}");
+        }
+        let [_, distance] = median_radii(&field, 0.3 / CELLS as f64);
+        // Light falls by e within α: a distance known to no better than that says nothing of where the light is.
+        assert!(distance * f64::from(field.inverse_alpha) > 1.0, "{distance}: use proven bounds after all");
+        // The form itself is sound and, for tiny cells, tight: it shrinks with the cell.
+        assert!(median_radii(&field, 1e-7)[1] < 1e-4);
+    }
+}

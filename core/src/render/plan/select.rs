@@ -1,0 +1,161 @@
+//! Which texture branches a frame runs: all but those whose largest possible effects, summed over what is left out of a
+//! pixel, stay within the budget.
+//!
+//! Why the sum is a bound. With weights w_s and masks m_i a pixel is Σ_s w_s sigmoid(Σ_i m_i c_i). A logit c_i is within
+//! its range's middle ± radius R_i ([`LogitRange`]); what is left out counts as the middle. So
+//! the sum of logits of a sample is off by at most r = Σ |m_i| R_i over what was left out, and its colour, as sigmoid has
+//! slope ≤ 1/4, by at most r / 4; or, taken at the middle of sigmoid's range over ± r, by at most 1/2. Both are at most
+//! Σ min(|m_i| R_i / 4, 1/2), a sum over pairs. The features' activations are sines: what is left out counts as 0 and is
+//! off by at most |m_i| w_s of their range's half, so they are charged the same way, in units of their range.
+
+use crate::render::plan::{
+    ROUNDING, ROUNDING_PER_LOGIT, Shown,
+    local::{LogitRange, Ready},
+    march::Marched,
+    rays::Rays,
+};
+
+/// A chunk's pairs to evaluate.
+pub struct Selection {
+    /// Per region the samples to evaluate, ascending.
+    pub samples: Vec<Vec<u32>>,
+    /// Per sample the regions left out, as bits.
+    pub left_out: Vec<u16>,
+    /// Rays whose background is evaluated, ascending.
+    pub background: Vec<u32>,
+    /// Per ray, what leaving out can change at most, in [0, 1] colour units.
+    pub bounds: Vec<f32>,
+}
+
+/// Charges of one ray's candidates within the budget, cheapest first: charge (as its bits) above, place below.
+type Candidates = Vec<u64>;
+
+/// Selects under `budget` per pixel, which what marching spent has a first claim on.
+pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budget: f32) -> Selection {
+    let (count, samples, regions) = (rays.count(), rays.samples, field.regions.len());
+    let pairs = samples * regions + 1;
+    let charges = Charges::new(field, shown);
+    let mut selection = Selection {
+        samples: vec![Vec::new(); regions],
+        left_out: vec![0; count * samples],
+        background: Vec::new(),
+        bounds: vec![0.0; count],
+    };
+    let mut candidates = Candidates::new();
+    for ray in 0..count {
+        let rounding = charges.rounding(marched, ray * samples..ray * samples + marched.marched[ray] as usize);
+        // A millionth of slack for the rounding of the charges' own sum.
+        let budget = ((budget - rounding - marched.spent(ray)) * (1.0 - 1e-6)).max(0.0);
+        // All charges up to here together take at most half of the budget: no need to sort them.
+        let negligible = budget / (2 * pairs) as f32;
+        let mut spent = 0.0;
+        candidates.clear();
+        let mut consider = |charge: f32, place: usize, leave_out: &mut dyn FnMut()| {
+            if charge <= negligible {
+                spent += charge;
+                leave_out();
+            } else if charge <= budget {
+                candidates.push(u64::from(charge.to_bits()) << 32 | place as u64);
+            }
+        };
+        for step in 0..marched.marched[ray] as usize {
+            let sample = ray * samples + step;
+            let weight = marched.weights[sample];
+            for (region, mask) in marched.masks[sample * regions..][..regions].iter().enumerate() {
+                let charge = weight * charges.of(region, *mask);
+                consider(charge, step * regions + region, &mut || selection.left_out[sample] |= 1 << region);
+            }
+        }
+        let mut background = field.background.is_some();
+        let behind = marched.remaining[ray] * charges.background;
+        if background {
+            consider(behind, samples * regions, &mut || background = false);
+        }
+        candidates.sort_unstable();
+        for candidate in &candidates {
+            let charge = f32::from_bits((candidate >> 32) as u32);
+            if spent + charge > budget {
+                break;
+            }
+            spent += charge;
+            let place = (candidate & u64::from(u32::MAX)) as usize;
+            if place == samples * regions {
+                background = false;
+            } else {
+                selection.left_out[ray * samples + place / regions] |= 1 << (place % regions);
+            }
+        }
+        for step in 0..marched.marched[ray] as usize {
+            let sample = ray * samples + step;
+            for (region, list) in selection.samples.iter_mut().enumerate() {
+                if selection.left_out[sample] & 1 << region == 0 {
+                    list.push(sample as u32);
+                }
+            }
+        }
+        if background {
+            selection.background.push(ray as u32);
+        }
+        selection.bounds[ray] = spent * (1.0 + 1e-6) + marched.spent(ray) + rounding;
+    }
+    selection
+}
+
+/// What leaving a region out charges per unit of weight.
+struct Charges {
+    /// Per region: R_i / 4, or 0 where the region is not shown.
+    colour: Vec<f32>,
+    /// Per region: 1/2 if it has features to show.
+    features: Vec<f32>,
+    /// 1/2 if there are normals; they are those of all regions, shown or not.
+    normals: f32,
+    /// Whether residuals are summed: then every region bends the normal, whatever its mask.
+    summed: bool,
+    background: f32,
+    /// Per region, the largest |c_i|.
+    logits: Vec<f32>,
+}
+
+impl Charges {
+    fn new(field: &Ready, shown: &Shown) -> Self {
+        let visible = |region: &crate::region::Region| f32::from(u8::from(shown.regions.contains(*region)));
+        let background = field.background_range.map_or(0.0, |range| {
+            let colour = (range.largest_radius() / 4.0).min(0.5);
+            let features = if shown.features { 0.5f32 } else { 0.0 };
+            colour.max(features) * visible(&crate::region::Region::Background)
+        });
+        Self {
+            colour: field
+                .regions
+                .iter()
+                .zip(&field.ranges)
+                .map(|(region, range)| range.largest_radius() / 4.0 * visible(region))
+                .collect(),
+            features: field
+                .regions
+                .iter()
+                .map(|region| if shown.features { 0.5 * visible(region) } else { 0.0 })
+                .collect(),
+            normals: if shown.normals { 0.5 } else { 0.0 },
+            summed: field.local.residual == crate::config::Residual::Sum,
+            background,
+            logits: field.ranges.iter().map(LogitRange::largest).collect(),
+        }
+    }
+
+    /// What rounding may take of a ray's budget.
+    fn rounding(&self, marched: &Marched, samples: std::ops::Range<usize>) -> f32 {
+        let regions = self.logits.len();
+        let masks = marched.masks[samples.start * regions..samples.end * regions].chunks_exact(regions);
+        let logits =
+            masks.map(|masks| masks.iter().zip(&self.logits).map(|(mask, logit)| mask.abs() * logit).sum::<f32>());
+        let largest = logits.fold(0.0, f32::max);
+        ROUNDING as f32 + ROUNDING_PER_LOGIT as f32 * largest
+    }
+
+    fn of(&self, region: usize, mask: f32) -> f32 {
+        let mask = mask.abs();
+        let normal = if self.summed { self.normals } else { self.normals * mask };
+        (mask * self.colour[region]).min(0.5).max(mask * self.features[region]).max(normal)
+    }
+}

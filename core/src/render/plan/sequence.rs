@@ -1,0 +1,311 @@
+//! Many views of one portrait over shared geometry.
+
+use candle_core::Tensor;
+use rayon::prelude::*;
+
+use crate::{
+    camera,
+    config::DensityKind,
+    error::Result,
+    render::{
+        RadianceField, RenderSettings, TwoPass, frame,
+        plan::{
+            CUT_SHARE, Chunk, FrameReport, Method, Parts, Planned, Shown, View, exhaustive, fields,
+            grid::Grid,
+            local::{LocalField, LocalInitial, Ready, length},
+            march::{Light, Marched},
+            rays::Rays,
+            render, select, shade,
+            state::{ChunkState, Room},
+        },
+    },
+};
+
+/// The share of a budget that interpolated distances and masks may spend in a pixel.
+const INTERPOLATION_SHARE: f64 = 0.25;
+/// The share that regions left out of cells may spend.
+const REGION_SHARE: f64 = 0.125;
+
+/// Views of one portrait that share a coarse grid of its geometry.
+///
+/// The grid tells where along a ray the light comes from. Shape branches run only where interpolated values could be
+/// too far off for the budget, and there only for the regions that matter in the cell; everything else is as in
+/// [`render`]. The bound it reports is an estimate ([`Method::Shared`]): the grid's errors are estimated from its
+/// vertices with a safety factor.
+///
+/// With [`RenderSettings::two_pass`] samples are placed at the surface instead of at regular depths: light comes from
+/// the grid's distances in `bins` bins, and the field is evaluated at its quantiles. That picture approaches the
+/// converged integral, not the exhaustive path at the settings' samples.
+///
+/// Fields whose masks see the view or whose distance starts from a network share nothing; they, and whatever [`render`] renders exhaustively, go that way.
+pub struct Sequence {
+    settings: RenderSettings,
+    shared: Option<Shared>,
+}
+
+struct Shared {
+    ready: Ready,
+    grid: Grid,
+}
+
+impl Sequence {
+    /// The views from `cameras` `[B, 6]`, all frames of the sequence, of the portrait in `field` (its first).
+    ///
+    /// # Errors
+    /// If settings contradict each other, or shapes do not fit.
+    pub fn new<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Self> {
+        let plannable = RenderSettings { two_pass: None, ..settings.clone() };
+        let first = fields(field, &cameras.narrow(0, 0, 1)?, &plannable)?.and_then(|fields| fields.into_iter().next());
+        let shared = match first {
+            Some(local) if is_shareable(&local) => {
+                let ready = Ready::new(local, Shown::new(settings).outputs())?;
+                let (low, high) = extent(cameras, settings)?;
+                let grid = Grid::new(&ready, low, high, (settings.budget * REGION_SHARE) as f32)?;
+                Some(Shared { ready, grid })
+            }
+            _ => None,
+        };
+        Ok(Self { settings: settings.clone(), shared })
+    }
+
+    /// (point, region) pairs whose shape branches ran for the grid.
+    pub fn grid_pairs(&self) -> usize {
+        self.shared.as_ref().map_or(0, |shared| shared.grid.pairs())
+    }
+
+    /// What the grid keeps in memory, bytes.
+    pub fn memory(&self) -> usize {
+        self.shared.as_ref().map_or(0, |shared| shared.grid.memory())
+    }
+
+    /// Pictures from `cameras` `[B, 6]`, each of the sequence's portrait. `field` is the one the sequence was made of.
+    ///
+    /// # Errors
+    /// As [`render`].
+    pub fn render<F: RadianceField>(&self, field: &F, cameras: &Tensor) -> Result<Planned> {
+        let Some(shared) = &self.shared else {
+            return match self.settings.two_pass {
+                Some(_) => exhaustive(field, cameras, &self.settings),
+                None => render(field, cameras, &self.settings),
+            };
+        };
+        let view = View::new(cameras, &self.settings)?;
+        let shown = Shown::new(&self.settings);
+        let mut parts = Parts::default();
+        let mut report = FrameReport::empty(Method::Shared, self.settings.budget);
+        for image in 0..cameras.dim(0)? {
+            for wave in view.waves() {
+                let chunks: Vec<(Rays, Chunk)> = wave
+                    .par_iter()
+                    .map(|range| shared.chunk(view.rays(image, *range)?, shown, &self.settings))
+                    .collect::<Result<_>>()?;
+                for ((rays, chunk), range) in chunks.iter().zip(wave) {
+                    let chunk_report = chunk.report(&shared.ready, rays, self.settings.budget);
+                    report = report.and(FrameReport { method: Method::Shared, ..chunk_report });
+                    parts.push(field, &view, image, *range, &chunk.pixels)?;
+                }
+            }
+        }
+        Ok(Planned { frame: parts.frame(&view)?, report })
+    }
+}
+
+/// Whether the geometry is the same from everywhere, and one grid holds all of it.
+fn is_shareable(local: &LocalField) -> bool {
+    !local.generators.shape.mask_view && !matches!(local.initial, LocalInitial::Network(_))
+}
+
+/// The box, world, that holds every sample of these views: the corners of their frustums.
+fn extent(cameras: &Tensor, settings: &RenderSettings) -> Result<([f32; 3], [f32; 3])> {
+    let corners = Tensor::new(&[[[0f32, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]], cameras.device())?;
+    let rays = camera::cast(cameras, &corners, 1, settings.field_of_view_rad)?;
+    let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
+    for depth in [settings.sampling.near, settings.sampling.far] {
+        let points = (&rays.directions * depth)?.broadcast_add(&rays.origins)?.flatten_to(1)?.to_vec2::<f32>()?;
+        for point in points {
+            for (axis, value) in point.iter().enumerate().take(3) {
+                low[axis] = low[axis].min(*value);
+                high[axis] = high[axis].max(*value);
+            }
+        }
+    }
+    Ok((low, high))
+}
+
+impl Shared {
+    fn chunk(&self, rays: Rays, shown: Shown, settings: &RenderSettings) -> Result<(Rays, Chunk)> {
+        let mut room = Room::default();
+        let budget = settings.budget;
+        let (rays, mut state, marched) = match &settings.two_pass {
+            Some(two_pass) => self.march_to_the_surface(rays, settings, two_pass, &mut room)?,
+            None => {
+                let mut state = self.state(&rays);
+                let marched = self.march(&rays, budget, &mut state, &mut room)?;
+                (rays, state, marched)
+            }
+        };
+        let selection = select::select(&self.ready, &rays, &marched, &shown, budget as f32);
+        let pixels = shade::shade(&self.ready, &rays, &marched, &selection, &shown, &mut state, &mut room)?;
+        Ok((rays, Chunk { marched, selection, pixels }))
+    }
+
+    /// Nothing known; regions that are left out of a cell have no mask there.
+    fn state(&self, rays: &Rays) -> ChunkState {
+        let mut state = ChunkState::new(&self.ready, rays.depths.len());
+        if matches!(self.ready.local.fusion, crate::config::Fusion::Softmax { .. }) {
+            state.raw.chunks_exact_mut(2).for_each(|raw| raw[0] = f32::NEG_INFINITY);
+        }
+        state
+    }
+
+    /// Marches rays at their own depths.
+    fn march(&self, rays: &Rays, budget: f64, state: &mut ChunkState, room: &mut Room) -> Result<Marched> {
+        let (samples, regions) = (rays.samples, self.ready.regions.len());
+        let mut marched = Marched::new(rays, regions);
+        let cut = (budget * CUT_SHARE) as f32;
+        // What each sample may spend of its pixel.
+        let spendable = (budget * INTERPOLATION_SHARE) as f32 / samples as f32;
+        let (mut exact, mut wanted) = (Vec::new(), Vec::new());
+        let mut places = vec![None; rays.depths.len()];
+        let mut interpolated = vec![false; rays.depths.len()];
+        for ray in 0..rays.count() {
+            let (mut light, mut brightest) = (Light::default(), Light::default());
+            for step in 0..samples {
+                let sample = ray * samples + step;
+                let takes_all = rays.closed && step + 1 == samples;
+                marched.marched[ray] = step as u32 + 1;
+                let Some(place) = self.grid.place(rays.point(sample)) else {
+                    exact.push(sample as u32);
+                    wanted.push(u16::MAX);
+                    continue;
+                };
+                places[sample] = Some(place);
+                let estimate = self.grid.estimate_at(place);
+                let distance = self.grid.distance(place);
+                marched.distances[sample] = distance;
+                let arriving = brightest.left();
+                let optical = |distance: f32| self.ready.density(distance) * rays.lengths[sample];
+                let dark = optical(distance - estimate.distance);
+                let bright = optical(distance + estimate.distance);
+                let weight = light.pass(self.ready.density(distance), rays.lengths[sample], takes_all);
+                brightest.pass(self.ready.density(distance + estimate.distance), rays.lengths[sample], takes_all);
+                let impact = arriving * ((-bright).exp() - (-dark).exp()) + weight * estimate.masks;
+                // Not `impact > spendable`: NaN must be looked at.
+                if impact <= spendable {
+                    interpolated[sample] = true;
+                    marched.estimated[ray] += impact;
+                } else {
+                    exact.push(sample as u32);
+                    wanted.push(estimate.relevant);
+                }
+                if brightest.left() <= cut {
+                    break;
+                }
+            }
+        }
+        marched.samples_evaluated = exact.len();
+        marched.shape_pairs = state.fill_shapes(&self.ready, rays, &exact, |place| wanted[place], room)?;
+        for ray in 0..rays.count() {
+            let mut light = Light::default();
+            let mut end = marched.marched[ray] as usize;
+            for step in 0..end {
+                let sample = ray * samples + step;
+                let takes_all = rays.closed && step + 1 == samples;
+                if interpolated[sample] {
+                    let weight =
+                        light.pass(self.ready.density(marched.distances[sample]), rays.lengths[sample], takes_all);
+                    marched.weights[sample] = weight;
+                    if let Some(place) = places[sample].filter(|_| weight != 0.0) {
+                        self.grid.masks(place, &mut marched.masks[sample * regions..][..regions]);
+                        marched.means[sample] = self.mean(rays.point(sample), marched.distances[sample]);
+                    }
+                } else {
+                    marched.fuse(&self.ready, rays, state, sample);
+                    let density = self.ready.density(marched.distances[sample]);
+                    marched.weights[sample] = light.pass(density, rays.lengths[sample], takes_all);
+                    let left_out = places[sample].map_or(0.0, |place| self.grid.estimate_at(place).left_out);
+                    marched.estimated[ray] += marched.weights[sample] * left_out;
+                }
+                let left = if takes_all { 0.0 } else { light.left() };
+                marched.remaining[ray] = left;
+                if left <= cut && step + 1 < end {
+                    end = step + 1;
+                    marched.marched[ray] = end as u32;
+                    break;
+                }
+            }
+            if end < samples || marched.remaining[ray] <= cut {
+                let left = std::mem::take(&mut marched.remaining[ray]);
+                marched.weights[ray * samples + end - 1] += left;
+                marched.cut[ray] = left;
+            }
+        }
+        Ok(marched)
+    }
+
+    /// Σ m_i Δd_i where only the whole distance is known: right for gated residuals, the only ones that need it.
+    fn mean(&self, point: [f32; 3], distance: f32) -> f32 {
+        match (self.ready.local.density, &self.ready.local.initial) {
+            (DensityKind::Density, _) => -distance,
+            (DensityKind::ResidualSdf, LocalInitial::Sphere { radius }) => distance - (length(point) - *radius as f32),
+            _ => distance,
+        }
+    }
+
+    /// Rays whose samples lie where the grid says the light comes from, each with the same share of it.
+    fn march_to_the_surface(
+        &self,
+        mut rays: Rays,
+        settings: &RenderSettings,
+        two_pass: &TwoPass,
+        room: &mut Room,
+    ) -> Result<(Rays, ChunkState, Marched)> {
+        let fine = frame::fine_bins(&settings.sampling, two_pass)?;
+        let (bins, samples, regions) = (fine.samples, two_pass.colour_samples, self.ready.regions.len());
+        let mut depths = Vec::with_capacity(rays.count() * samples);
+        let mut remaining = Vec::with_capacity(rays.count());
+        let mut light_of_bins = vec![0f64; bins];
+        for direction in &rays.directions {
+            let unit = length(*direction);
+            let mut light = Light::default();
+            for (bin, weight) in light_of_bins.iter_mut().enumerate() {
+                let depth = (fine.near + fine.interval() * (bin as f64 + 0.5)) as f32;
+                let point = std::array::from_fn(|axis| direction[axis] * depth + rays.origin[axis]);
+                let distance = self.grid.place(point).map_or(f32::INFINITY, |place| self.grid.distance(place));
+                let takes_all = rays.closed && bin + 1 == bins;
+                let passed = light.pass(self.ready.density(distance), fine.interval() as f32 * unit, takes_all);
+                *weight = f64::from(passed);
+            }
+            remaining.push(if rays.closed { 0.0 } else { light.left() });
+            depths.extend(frame::quantiles_of_ray(&light_of_bins, &fine, samples).map(|depth| depth as f32));
+        }
+        rays.samples = samples;
+        rays.depths = depths;
+        rays.lengths = vec![0.0; rays.depths.len()];
+        let mut state = self.state(&rays);
+        let mut marched = Marched::new(&rays, regions);
+        let (mut lit, mut wanted) = (Vec::new(), Vec::new());
+        for ray in 0..rays.count() {
+            let share = (1.0 - remaining[ray]) / samples as f32;
+            marched.remaining[ray] = remaining[ray];
+            marched.marched[ray] = samples as u32;
+            // A pixel without light needs no sample.
+            if share * samples as f32 <= (settings.budget * CUT_SHARE) as f32 {
+                marched.estimated[ray] = share * samples as f32;
+                continue;
+            }
+            for sample in ray * samples..(ray + 1) * samples {
+                marched.weights[sample] = share;
+                lit.push(sample as u32);
+                let place = self.grid.place(rays.point(sample));
+                wanted.push(place.map_or(u16::MAX, |place| self.grid.estimate_at(place).relevant));
+            }
+        }
+        marched.samples_evaluated = lit.len();
+        marched.shape_pairs = state.fill_shapes(&self.ready, &rays, &lit, |place| wanted[place], room)?;
+        for sample in lit {
+            marched.fuse(&self.ready, &rays, &state, sample as usize);
+        }
+        Ok((rays, state, marched))
+    }
+}
