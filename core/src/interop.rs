@@ -4,6 +4,7 @@ pub mod animation;
 pub mod authors;
 pub mod authors_checkpoint;
 pub mod authors_nets;
+pub mod chart;
 pub mod mesh;
 pub mod sheet;
 pub mod surface;

@@ -1,0 +1,428 @@
+//! Charts of measurements as SVG files: lines over a number, bars over names, histograms. Every axis has a title with
+//! its unit; colours are told apart by colour-blind people too (Okabe and Ito, 2008).
+
+use std::{ops::Range, path::Path};
+
+use plotters::{
+    coord::{
+        Shift,
+        ranged1d::{DefaultFormatting, KeyPointHint, Ranged},
+    },
+    prelude::*,
+};
+
+use crate::{
+    data::picture,
+    error::{Error, Result},
+};
+
+/// Width and height of a chart, pixels.
+const SIZE: (u32, u32) = (900, 540);
+const FONT: &str = "sans-serif";
+const PALETTE: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(90, 90, 90),
+];
+/// Axes aim at this many ticks.
+const TICKS: f64 = 6.0;
+
+/// One axis.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Axis {
+    /// What is shown and its unit, e.g. `time per frame, seconds`.
+    pub title: String,
+    /// Powers of ten at equal distances. Values that are not positive are left out.
+    pub logarithmic: bool,
+    /// Whether 0 must be on the axis; without effect on a logarithmic one.
+    pub from_zero: bool,
+}
+
+impl Axis {
+    /// A linear axis.
+    pub fn linear(title: impl Into<String>) -> Self {
+        Self { title: title.into(), ..Self::default() }
+    }
+
+    /// A logarithmic axis.
+    pub fn logarithmic(title: impl Into<String>) -> Self {
+        Self { logarithmic: true, ..Self::linear(title) }
+    }
+
+    /// The same axis with 0 on it.
+    #[must_use]
+    pub fn with_zero(self) -> Self {
+        Self { from_zero: true, ..self }
+    }
+
+    /// Where on the axis a value lies; none if it cannot be shown.
+    fn place(&self, value: f64) -> Option<f64> {
+        let place = if self.logarithmic { value.log10() } else { value };
+        place.is_finite().then_some(place)
+    }
+
+    fn label(&self, place: f64) -> String {
+        number(if self.logarithmic { 10f64.powf(place) } else { place })
+    }
+
+    /// Ends and ticks of an axis that shows all `places`.
+    fn ruler(&self, places: impl Iterator<Item = f64>) -> Ruler {
+        let (mut low, mut high) = places.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+        if low > high {
+            (low, high) = (0.0, 1.0);
+        }
+        if self.from_zero && !self.logarithmic {
+            (low, high) = (low.min(0.0), high.max(0.0));
+        }
+        if high - low < 1e-12 * high.abs().max(1e-12) {
+            let margin = if low == 0.0 || self.logarithmic { 0.5 } else { 0.05 * low.abs() };
+            (low, high) = (low - margin, high + margin);
+        }
+        let ticks = if self.logarithmic && high - low > 0.6 {
+            decades(low, high)
+        } else {
+            let step = round_step((high - low) / TICKS);
+            (low, high) = ((low / step).floor() * step, (high / step).ceil() * step);
+            (0..=((high - low) / step).round() as usize).map(|index| low + index as f64 * step).collect()
+        };
+        Ruler { low, high, ticks }
+    }
+}
+
+/// The ends and ticks of an axis, in places.
+#[derive(Clone, Debug)]
+struct Ruler {
+    low: f64,
+    high: f64,
+    ticks: Vec<f64>,
+}
+
+impl Ranged for Ruler {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, (first, last): (i32, i32)) -> i32 {
+        let share = (value - self.low) / (self.high - self.low);
+        first + (share * f64::from(last - first)).round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        if hint.weight().allow_light_points() { Vec::new() } else { self.ticks.clone() }
+    }
+
+    fn range(&self) -> Range<f64> {
+        self.low..self.high
+    }
+}
+
+/// Ticks of a logarithmic axis: powers of ten, and their doubles and halves where there is room.
+fn decades(low: f64, high: f64) -> Vec<f64> {
+    let factors: &[f64] = if high - low > 3.0 { &[1.0] } else { &[1.0, 2.0, 5.0] };
+    let powers = low.floor() as i32..=high.ceil() as i32;
+    let ticks = powers.flat_map(|power| factors.iter().map(move |factor| factor.log10() + f64::from(power)));
+    ticks.filter(|tick| (low - 1e-9..=high + 1e-9).contains(tick)).collect()
+}
+
+/// The next of 1, 2 and 5 times a power of ten.
+fn round_step(step: f64) -> f64 {
+    let power = 10f64.powf(step.log10().floor());
+    [1.0, 2.0, 5.0, 10.0].into_iter().map(|factor| factor * power).find(|round| *round >= step).unwrap_or(step)
+}
+
+/// A number with as many digits as a tick needs.
+fn number(value: f64) -> String {
+    // Multiples of a step such as 0.1 end in …0001.
+    let rounded = (value * 1e9).round() / 1e9;
+    let size = value.abs();
+    if size != 0.0 && !(1e-4..1e6).contains(&size) { format!("{value:.1e}") } else { format!("{rounded}") }
+}
+
+/// A named line.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Series {
+    /// Shown in the legend.
+    pub name: String,
+    /// In drawing order; points that are not finite are left out.
+    pub points: Vec<(f64, f64)>,
+    /// Whether each point has a dot: for few, measured points.
+    pub dots: bool,
+}
+
+/// Lines over a number.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LineChart {
+    /// Above the chart.
+    pub title: String,
+    /// Across.
+    pub x: Axis,
+    /// Upwards.
+    pub y: Axis,
+    /// The lines.
+    pub series: Vec<Series>,
+}
+
+impl LineChart {
+    /// The chart as SVG.
+    ///
+    /// # Errors
+    /// [`Error::Config`] if nothing can be drawn.
+    pub fn svg(&self) -> Result<String> {
+        let lines: Vec<Vec<(f64, f64)>> = self
+            .series
+            .iter()
+            .map(|series| {
+                let points = series.points.iter();
+                points.filter_map(|&(x, y)| Some((self.x.place(x)?, self.y.place(y)?))).collect()
+            })
+            .collect();
+        let x = self.x.ruler(lines.iter().flatten().map(|point| point.0));
+        let y = self.y.ruler(lines.iter().flatten().map(|point| point.1));
+        draw(|area| {
+            let mut chart = frame(area, &self.title, (&x, &y))?;
+            mesh(&mut chart, (&self.x.title, &|place| self.x.label(*place)), (&self.y, &|place| self.y.label(*place)))?;
+            for (index, (series, line)) in self.series.iter().zip(&lines).enumerate() {
+                let colour = colour(index);
+                let drawn = chart.draw_series(LineSeries::new(line.iter().copied(), colour.stroke_width(2)));
+                let drawn = drawn.map_err(fault)?;
+                if !series.name.is_empty() {
+                    drawn
+                        .label(&series.name)
+                        .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], colour.stroke_width(3)));
+                }
+                if series.dots {
+                    let dots = line.iter().map(|&point| Circle::new(point, 4, colour.filled()));
+                    chart.draw_series(dots).map_err(fault)?;
+                }
+            }
+            legend(&mut chart, self.series.iter().any(|series| !series.name.is_empty()))
+        })
+    }
+
+    /// Writes the chart to `path`, whole or not at all.
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
+        picture::write_file(path.as_ref(), self.svg()?.as_bytes())
+    }
+}
+
+/// Bars over names, side by side where there are several series.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct BarChart {
+    /// Above the chart.
+    pub title: String,
+    /// What the names are.
+    pub x_title: String,
+    /// Upwards; 0 is always on a linear axis.
+    pub y: Axis,
+    /// Name of each place.
+    pub names: Vec<String>,
+    /// Name in the legend (empty: none) and one value for every place; none draws no bar.
+    pub series: Vec<(String, Vec<Option<f64>>)>,
+}
+
+impl BarChart {
+    /// A chart of one value for every name.
+    pub fn single(title: impl Into<String>, x_title: impl Into<String>, y: Axis, bars: &[(String, f64)]) -> Self {
+        Self {
+            title: title.into(),
+            x_title: x_title.into(),
+            y,
+            names: bars.iter().map(|(name, _)| name.clone()).collect(),
+            series: vec![(String::new(), bars.iter().map(|(_, value)| Some(*value)).collect())],
+        }
+    }
+
+    /// The chart as SVG.
+    ///
+    /// # Errors
+    /// [`Error::Config`] if nothing can be drawn.
+    pub fn svg(&self) -> Result<String> {
+        let y = Axis { from_zero: true, ..self.y.clone() };
+        let values = self.series.iter().flat_map(|(_, values)| values).flatten();
+        let mut up = y.ruler(values.filter_map(|value| y.place(*value)));
+        if y.logarithmic {
+            // The smallest bar must be seen too.
+            up.low -= 0.1 * (up.high - up.low);
+        }
+        let base = if y.logarithmic { up.low } else { 0.0 };
+        let places: Vec<f64> = (0..self.names.len()).map(|index| index as f64 + 0.5).collect();
+        let across = Ruler { low: 0.0, high: self.names.len().max(1) as f64, ticks: places.clone() };
+        let width = 0.8 / self.series.len().max(1) as f64;
+        let name = |place: &f64| self.names.get(place.floor().max(0.0) as usize).cloned().unwrap_or_default();
+        draw(|area| {
+            let mut chart = frame(area, &self.title, (&across, &up))?;
+            mesh(&mut chart, (&self.x_title, &name), (&y, &|place| y.label(*place)))?;
+            for (index, (label, values)) in self.series.iter().enumerate() {
+                let colour = colour(index);
+                let bars = values.iter().zip(&places).filter_map(|(value, place)| {
+                    let top = y.place((*value)?)?;
+                    let left = place - 0.4 + width * index as f64;
+                    Some(Rectangle::new([(left, base), (left + 0.92 * width, top)], colour.filled()))
+                });
+                let drawn = chart.draw_series(bars).map_err(fault)?;
+                if !label.is_empty() {
+                    drawn
+                        .label(label)
+                        .legend(move |(x, y)| Rectangle::new([(x, y - 5), (x + 14, y + 5)], colour.filled()));
+                }
+            }
+            legend(&mut chart, self.series.iter().any(|(label, _)| !label.is_empty()))
+        })
+    }
+
+    /// Writes the chart to `path`, whole or not at all.
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
+        picture::write_file(path.as_ref(), self.svg()?.as_bytes())
+    }
+}
+
+/// How often values fall into equal intervals: one stepped outline for every series, so that several can be compared.
+pub fn histogram(title: impl Into<String>, x: Axis, series: &[(String, Vec<f64>)]) -> LineChart {
+    const BINS: usize = 24;
+    let places = || series.iter().flat_map(|(_, values)| values).filter_map(|value| x.place(*value));
+    let Ruler { low, high, .. } = x.ruler(places());
+    let width = (high - low) / BINS as f64;
+    let value_at = |bin: usize| {
+        let place = low + width * bin as f64;
+        if x.logarithmic { 10f64.powf(place) } else { place }
+    };
+    let outline = |(name, values): &(String, Vec<f64>)| {
+        let mut counts = [0usize; BINS];
+        for place in values.iter().filter_map(|value| x.place(*value)) {
+            let bin = (((place - low) / width) as usize).min(BINS - 1);
+            counts[bin] += 1;
+        }
+        let mut points = vec![(value_at(0), 0.0)];
+        for (bin, count) in counts.into_iter().enumerate() {
+            points.extend([(value_at(bin), count as f64), (value_at(bin + 1), count as f64)]);
+        }
+        points.push((value_at(BINS), 0.0));
+        Series { name: name.clone(), points, dots: false }
+    };
+    let series = series.iter().map(outline).collect();
+    LineChart { title: title.into(), x, y: Axis::linear("count").with_zero(), series }
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<Ruler, Ruler>>;
+
+fn draw(content: impl Fn(&Area<'_>) -> Result<()>) -> Result<String> {
+    let mut text = String::new();
+    {
+        let area = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
+        area.fill(&WHITE).map_err(fault)?;
+        content(&area)?;
+        area.present().map_err(fault)?;
+    }
+    Ok(text)
+}
+
+fn frame<'a, 'b>(area: &'a Area<'b>, title: &str, (x, y): (&Ruler, &Ruler)) -> Result<Chart<'a, 'b>> {
+    ChartBuilder::on(area)
+        .caption(title, (FONT, 22))
+        .margin(16)
+        .x_label_area_size(52)
+        .y_label_area_size(84)
+        .build_cartesian_2d(x.clone(), y.clone())
+        .map_err(fault)
+}
+
+type Format<'a> = &'a dyn Fn(&f64) -> String;
+
+fn mesh(chart: &mut Chart<'_, '_>, x: (&str, Format<'_>), y: (&Axis, Format<'_>)) -> Result<()> {
+    chart
+        .configure_mesh()
+        .x_desc(x.0)
+        .y_desc(&y.0.title)
+        .x_label_formatter(&x.1)
+        .y_label_formatter(&y.1)
+        .label_style((FONT, 14))
+        .axis_desc_style((FONT, 16))
+        .light_line_style(TRANSPARENT)
+        .bold_line_style(BLACK.mix(0.12))
+        .draw()
+        .map_err(fault)
+}
+
+fn legend<'a, 'b: 'a>(chart: &mut Chart<'a, 'b>, wanted: bool) -> Result<()> {
+    if !wanted {
+        return Ok(());
+    }
+    chart
+        .configure_series_labels()
+        .label_font((FONT, 14))
+        .background_style(WHITE.mix(0.85))
+        .border_style(BLACK.mix(0.3))
+        .position(SeriesLabelPosition::UpperRight)
+        .draw()
+        .map_err(fault)
+}
+
+fn colour(index: usize) -> RGBColor {
+    PALETTE[index % PALETTE.len()]
+}
+
+fn fault(error: impl std::fmt::Display) -> Error {
+    Error::config("chart", format!("cannot be drawn: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_round_and_cover_the_values() {
+        let Ruler { low, high, ticks } = Axis::linear("").ruler([0.13, 0.97].into_iter());
+        assert!(low <= 0.13 && high >= 0.97 && (4..=10).contains(&ticks.len()), "{low} {high} {ticks:?}");
+        assert_eq!(number(ticks[0]), "0");
+        let Ruler { low, high, ticks } = Axis::logarithmic("").ruler([-3.2, 2.1].into_iter());
+        assert_eq!((low, high, ticks), (-3.2, 2.1, vec![-3.0, -2.0, -1.0, 0.0, 1.0, 2.0]));
+        // One value, no value: still a range to draw in.
+        for values in [vec![], vec![0.0], vec![5.0], vec![-1e-20]] {
+            let Ruler { low, high, ticks } = Axis::linear("").ruler(values.iter().copied());
+            assert!(low < high && ticks.len() > 1, "{values:?}: {low} {high} {ticks:?}");
+        }
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let shown = [0.1 + 0.2, 1e-7, 2e7, -0.05, 64.0].map(number);
+        assert_eq!(shown, ["0.3", "1.0e-7", "2.0e7", "-0.05", "64"]);
+    }
+
+    #[test]
+    fn charts_say_what_they_show() {
+        let chart = LineChart {
+            title: "time against error".into(),
+            x: Axis::logarithmic("time per frame, seconds"),
+            y: Axis::linear("error, dB"),
+            series: vec![Series {
+                name: "ours".into(),
+                points: vec![(0.1, 20.0), (0.0, 3.0), (2.0, 30.0)],
+                dots: true,
+            }],
+        };
+        let svg = chart.svg().unwrap();
+        for text in ["time against error", "time per frame, seconds", "error, dB", "ours"] {
+            assert!(svg.contains(text), "{text}");
+        }
+        // The point at 0 has no place on a logarithmic axis: two dots in the chart.
+        assert_eq!(svg.matches("<circle").count(), 2);
+        assert!(svg.trim_end().ends_with("</svg>"));
+
+        let bars = [("hair".to_owned(), 0.2), ("neck".to_owned(), f64::NAN)];
+        let svg = BarChart::single("changes", "region", Axis::linear("change, 0 to 1"), &bars).svg().unwrap();
+        assert!(svg.contains("hair") && svg.contains("neck") && svg.contains("change, 0 to 1"));
+    }
+
+    #[test]
+    fn histograms_count_every_value_once() {
+        let values = vec![1.0, 1.0, 2.0, 9.5, f64::NAN];
+        let chart = histogram("", Axis::linear("x"), &[("a".into(), values)]);
+        let tops = chart.series[0].points[1..].iter().step_by(2).map(|point| point.1);
+        assert_eq!(tops.sum::<f64>(), 4.0);
+    }
+}
