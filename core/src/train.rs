@@ -8,6 +8,7 @@ pub mod events;
 pub mod field_stage;
 pub mod losses;
 pub mod optimiser;
+pub mod portrait_codes;
 pub mod preview;
 pub mod trainer;
 pub mod upsampler_stage;

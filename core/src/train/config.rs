@@ -83,6 +83,11 @@ pub struct WarmupConfig {
     pub learning_rate: f64,
     /// Learning rate of the portraits' codes.
     pub code_learning_rate: f64,
+    /// Fraction of the run after which every portrait's regions get codes of their own, added to the mapped one: a z of
+    /// `style_dim` numbers cannot hold a face. 1 leaves them out, as the recipe does.
+    pub region_codes_from: f64,
+    /// Learning rate of those.
+    pub region_code_learning_rate: f64,
     /// Schedule of both.
     pub schedule: Schedule,
     /// Adam's β.
@@ -125,6 +130,8 @@ pub struct WarmupWeights {
     pub fill: f64,
     /// Mean square of the codes.
     pub code_norm: f64,
+    /// Mean square of the regions' own codes.
+    pub region_code_norm: f64,
 }
 
 /// The paper's first stage.
@@ -235,6 +242,8 @@ impl TrainConfig {
                 depth_range: [0.895, 1.10],
                 learning_rate: 1e-3,
                 code_learning_rate: 3e-3,
+                region_codes_from: 0.5,
+                region_code_learning_rate: 1e-2,
                 schedule: Schedule { warmup_steps: 100, hold: 0.3, floor: 0.03 },
                 betas: [0.9, 0.99],
                 gradient_bound: 1.0,
@@ -252,6 +261,7 @@ impl TrainConfig {
                     minimal_surface: 0.001,
                     fill: 0.1,
                     code_norm: 1e-3,
+                    region_code_norm: 1e-2,
                 },
                 eikonal_share: 1.0 / 6.0,
             },

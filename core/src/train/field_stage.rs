@@ -29,6 +29,7 @@ use crate::{
         events::Metrics,
         losses::{self, DecouplingRenders, MINIMAL_SURFACE_SHARPNESS},
         optimiser::{Adam, Betas, Group},
+        portrait_codes::PortraitCodes,
         preview,
         trainer::{Inputs, StageRun, Start},
     },
@@ -48,7 +49,7 @@ pub struct FieldStage {
     perceptual: Option<Perceptual>,
     generator: Generator,
     /// Codes of the training portraits from a warm-up, for the stage after this one.
-    portrait_codes: Option<Tensor>,
+    portrait_codes: Option<PortraitCodes>,
     average: Average,
     global: Discriminator,
     semantic: Discriminator,

@@ -11,7 +11,7 @@ use std::{
     time::Instant,
 };
 
-use candle_core::{Device, Tensor};
+use candle_core::Device;
 use image::RgbImage;
 
 use crate::{
@@ -27,6 +27,7 @@ use crate::{
         config::{Stage, TrainConfig},
         events::{Event, Metrics, StepReport},
         field_stage::FieldStage,
+        portrait_codes::PortraitCodes,
         upsampler_stage::UpsamplerStage,
         warmup::Warmup,
     },
@@ -51,8 +52,8 @@ pub trait StageRun {
 pub struct Start {
     /// Its weights are copied, never changed.
     pub generator: Generator,
-    /// z of the training portraits, then of their mirrored copies, `[M, D]`, if they have codes.
-    pub portrait_codes: Option<Tensor>,
+    /// The training portraits' own codes, if a warm-up gave them any.
+    pub portrait_codes: Option<PortraitCodes>,
 }
 
 impl Start {
@@ -60,26 +61,13 @@ impl Start {
     pub fn open(path: &Path, device: &Device) -> Result<Self> {
         let generator = Generator::open(path, device)?;
         let path = path.with_file_name(CODES_FILE);
-        let portrait_codes = if path.is_file() {
-            let (mut tensors, _) = file::parse_safetensors(&path, &file::read_bytes(&path)?)?;
-            Some(
-                tensors
-                    .remove(CODES)
-                    .ok_or_else(|| Error::malformed(&path, "holds no portrait codes"))?
-                    .to_device(device)?,
-            )
-        } else {
-            None
-        };
+        let portrait_codes = if path.is_file() { Some(PortraitCodes::read(&path, device)?) } else { None };
         Ok(Self { generator, portrait_codes })
     }
 
     fn save_codes(&self, run: &Path) -> Result<()> {
         match &self.portrait_codes {
-            Some(codes) => {
-                let tensors = Tensors::from([(CODES.to_owned(), codes.clone())]);
-                file::write_safetensors(&run.join(CODES_FILE), &tensors, &[])
-            }
+            Some(codes) => codes.write(&run.join(CODES_FILE)),
             None => Ok(()),
         }
     }
@@ -87,7 +75,6 @@ impl Start {
 
 /// Where a run keeps the training portraits' codes.
 const CODES_FILE: &str = "codes.safetensors";
-const CODES: &str = "codes";
 
 /// What a run needs besides its configuration.
 pub struct Inputs {

@@ -34,6 +34,7 @@ use crate::{
         events::Metrics,
         losses,
         optimiser::{Adam, Betas, Group},
+        portrait_codes::PortraitCodes,
         preview,
         trainer::{Inputs, StageRun, Start},
     },
@@ -63,7 +64,7 @@ pub struct UpsamplerStage {
 struct Paired {
     portraits: Cached,
     draws: Vec<Draw>,
-    codes: Tensor,
+    codes: PortraitCodes,
     renders: Vec<Option<Render>>,
     kept: usize,
 }
@@ -175,8 +176,7 @@ impl UpsamplerStage {
         let target =
             target.narrow(2, top * factor, crop * factor)?.narrow(3, left * factor, crop * factor)?.contiguous()?;
         let rows: Vec<u32> = rows.iter().map(|row| *row as u32).collect();
-        let z = paired.codes.index_select(&Tensor::from_vec(rows, frames.len(), &self.device)?, 0)?;
-        let codes = codes::broadcast(&self.generator.map(&z)?.detach())?;
+        let codes = paired.codes.codes(&self.generator, &rows)?.detach();
         let output = self.generator.upsample(&frame, &codes, None)?;
 
         let pixels = (losses::colour_l1(&output.rgb, &target)? * 2.0)?;
@@ -247,20 +247,20 @@ impl UpsamplerStage {
 }
 
 impl Paired {
-    fn new(config: &TrainConfig, inputs: &Inputs, codes: Option<&Tensor>, resolution: usize) -> Result<Self> {
+    fn new(config: &TrainConfig, inputs: &Inputs, codes: Option<&PortraitCodes>, resolution: usize) -> Result<Self> {
         let count = inputs.dataset.len();
         let draws: Vec<Draw> = [false, true][..if config.mirror { 2 } else { 1 }]
             .iter()
             .flat_map(|mirrored| (0..count).map(|index| Draw { index, mirrored: *mirrored }))
             .collect();
-        let codes = codes.filter(|codes| codes.dim(0).is_ok_and(|rows| rows == draws.len())).ok_or_else(|| {
+        let codes = codes.filter(|codes| codes.count() == draws.len()).ok_or_else(|| {
             let reason = "pairs need the codes a warm-up on the same data left beside its model; \
                           run --stage all, or --set upsampler.pixels=0 upsampler.perceptual=0";
             Error::config("upsampler.pixels", reason)
         })?;
         let portraits = Cached::new(&inputs.dataset, &[resolution], &|_| ())?;
         let renders = vec![None; draws.len()];
-        Ok(Self { portraits, draws, codes: codes.to_device(&inputs.device)?, renders, kept: 0 })
+        Ok(Self { portraits, draws, codes: codes.clone(), renders, kept: 0 })
     }
 
     /// The render of a training portrait from its own camera.
@@ -268,7 +268,7 @@ impl Paired {
         if let Some(Some(render)) = self.renders.get(row) {
             return Ok(render.clone());
         }
-        let codes = codes::broadcast(&generator.map(&self.codes.narrow(0, row, 1)?)?)?;
+        let codes = self.codes.codes(generator, &[row as u32])?;
         let camera = self.portraits.camera(self.draws[row]).unwrap_or_default();
         let cameras = Camera::parameter_tensor(&[camera], &generator.device())?;
         let settings = RenderSettings { two_pass: Some(TwoPass::default()), ..generator.render_settings() };
@@ -364,8 +364,7 @@ impl StageRun for UpsamplerStage {
         let rows: Vec<u32> = (0..count).map(|index| (index * paired.portraits.len() / count) as u32).collect();
         let cameras: Vec<Camera> =
             rows.iter().map(|row| paired.portraits.camera(paired.draws[*row as usize]).unwrap_or_default()).collect();
-        let z = paired.codes.index_select(&Tensor::from_vec(rows, count, &self.device)?, 0)?;
-        preview::grid(&finished, &codes::broadcast(&finished.map(&z)?)?, &cameras)
+        preview::grid(&finished, &paired.codes.codes(&finished, &rows)?, &cameras)
     }
 
     fn finished(&self) -> Result<Start> {

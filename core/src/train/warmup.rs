@@ -23,6 +23,7 @@ use crate::{
         events::Metrics,
         losses::{self, MINIMAL_SURFACE_SHARPNESS, RegionColours},
         optimiser::{Adam, Betas, Group},
+        portrait_codes::{PortraitCodes, RowTable},
         preview,
         trainer::{Inputs, StageRun, Start},
         whiten::whiten,
@@ -40,8 +41,9 @@ const EIKONAL_SPREAD: f64 = 0.0036;
 /// A region counts as present in a portrait from this many pixels of its 32² mask on.
 const PRESENT_PIXELS: f32 = 1.5;
 
-/// Name of the codes in checkpoints.
+/// Names of the codes in checkpoints.
 const CODES: &str = "codes";
+const REGION_CODES: &str = "region_codes";
 /// The first element of every stream drawn here.
 const STREAM: u64 = 0x7761_726d;
 
@@ -56,6 +58,9 @@ pub struct Warmup {
     log_alpha: Var,
     /// z of every portrait, then of every mirrored one, `[M, D]`.
     codes: Var,
+    /// What every region of every portrait adds to its mapped z, `[M, 9, 2, D]`; none if the configuration wants none.
+    region_codes: Option<RowTable>,
+    betas: Betas,
     /// Mean colour in [-1, 1] of each region of each portrait, `[M, 9, 3]`; mirrored portraits share theirs.
     region_colours: Tensor,
     /// 1 where a region is present, `[M, 9]`.
@@ -84,7 +89,18 @@ impl Warmup {
         };
         let all = draws(portraits.len(), config.mirror);
         let (features, region_colours, present) = describe(&portraits, &all, &inputs.device)?;
-        let codes = Var::from_tensor(&whiten(&features, generator.config().field.style_dim, config.seed)?)?;
+        let style_dim = generator.config().field.style_dim;
+        let known = start.and_then(|start| start.portrait_codes.as_ref()).filter(|known| known.count() == all.len());
+        let codes = match known {
+            Some(known) => known.noise.copy()?,
+            None => whiten(&features, style_dim, config.seed)?,
+        };
+        let codes = Var::from_tensor(&codes)?;
+        let mut region_codes =
+            (stage.region_codes_from < 1.0).then(|| RowTable::zeros(all.len(), &[REGION_COUNT, 2, style_dim]));
+        if let (Some(table), Some(offsets)) = (&mut region_codes, known.and_then(|known| known.offsets.as_ref())) {
+            table.set(offsets)?;
+        }
 
         let under = |prefix: &str| generator.parameters().within(prefix).variables();
         let (alpha, field): (Vec<_>, Vec<_>) =
@@ -97,7 +113,8 @@ impl Warmup {
             group(under("mapping"), stage.learning_rate, None),
             group(vec![(CODES.to_owned(), codes.clone())], stage.code_learning_rate, None),
         ];
-        let optimiser = Adam::new(groups, Betas { first: stage.betas[0], second: stage.betas[1] });
+        let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
+        let optimiser = Adam::new(groups, betas);
         Ok(Self {
             config: stage,
             seed: config.seed,
@@ -107,6 +124,8 @@ impl Warmup {
             generator,
             log_alpha,
             codes,
+            region_codes,
+            betas,
             region_colours,
             present,
             optimiser,
@@ -159,6 +178,13 @@ impl Warmup {
         let device = &self.device;
         Ok(Batch {
             resolution,
+            region_codes: self
+                .region_codes
+                .as_ref()
+                .filter(|_| progress >= config.region_codes_from)
+                .map(|table| table.gather(&rows, device))
+                .transpose()?,
+            row_numbers: rows.clone(),
             rows: Tensor::from_vec(rows, batch, device)?,
             cameras: Camera::parameter_tensor(&cameras, device)?,
             pixels: Tensor::from_vec(pixels, (batch, rays, 2), device)?,
@@ -172,7 +198,11 @@ impl Warmup {
         let config = &self.config;
         let weights = &config.weights;
         let z = self.codes.as_tensor().index_select(&batch.rows, 0)?;
-        let field = self.generator.field().portraits(&codes::broadcast(&self.generator.map(&z)?)?)?;
+        let mut codes = codes::broadcast(&self.generator.map(&z)?)?;
+        if let Some(offsets) = &batch.region_codes {
+            codes = (codes + offsets.as_tensor())?;
+        }
+        let field = self.generator.field().portraits(&codes)?;
         let rays = camera::cast(&batch.cameras, &batch.pixels, batch.resolution, camera::FIELD_OF_VIEW_RAD)?;
         let bundle = RayBundle::new(rays)?;
         let sampling = self.sampling();
@@ -194,6 +224,7 @@ impl Warmup {
         let gradient = gradient.ok_or_else(|| Error::config("gradient", "the field gave none"))?;
         let eikonal = losses::eikonal(&gradient)?;
         let code_norm = losses::latent(&z)?;
+        let region_code_norm = batch.region_codes.as_ref().map(|offsets| losses::latent(offsets)).transpose()?;
 
         let mut metrics = Metrics::default();
         let mut total = Tensor::zeros((), DType::F32, &self.device)?;
@@ -208,6 +239,10 @@ impl Warmup {
         ] {
             total = (total + (loss * weight)?)?;
             metrics.push(name, f64::from(loss.to_scalar::<f32>()?));
+        }
+        if let Some(loss) = &region_code_norm {
+            total = (total + (loss * weights.region_code_norm)?)?;
+            metrics.push("region_code_norm", f64::from(loss.to_scalar::<f32>()?));
         }
         Ok((total, metrics))
     }
@@ -243,6 +278,11 @@ impl Warmup {
         }
     }
 
+    fn portrait_codes(&self) -> Result<PortraitCodes> {
+        let offsets = self.region_codes.as_ref().map(|table| -> Result<Tensor> { Ok(table.tensor()?.to_device(&self.device)?) });
+        Ok(PortraitCodes { noise: self.codes.as_tensor().copy()?.detach(), offsets: offsets.transpose()? })
+    }
+
     fn set_alpha(&self, progress: f64) -> Result<()> {
         let [from, to] = self.config.alpha;
         let moved = (progress / self.config.alpha_hold.max(1e-9)).min(1.0);
@@ -254,6 +294,9 @@ impl Warmup {
 struct Batch {
     resolution: usize,
     rows: Tensor,
+    row_numbers: Vec<u32>,
+    /// The rows' share of the table, to differentiate by: `[B, 9, 2, D]`.
+    region_codes: Option<Var>,
     cameras: Tensor,
     /// `[B, R, 2]`
     pixels: Tensor,
@@ -274,7 +317,13 @@ impl StageRun for Warmup {
             return Err(Error::not_finite(format!("loss term {quantity}")));
         }
         let factor = self.config.schedule.factor(step, self.config.steps);
-        let norms = self.optimiser.step(&loss.backward()?, factor)?;
+        let gradients = loss.backward()?;
+        let norms = self.optimiser.step(&gradients, factor)?;
+        if let (Some(table), Some(gathered)) = (&mut self.region_codes, &batch.region_codes)
+            && let Some(gradient) = gradients.get(gathered)
+        {
+            table.step(&batch.row_numbers, gradient, self.config.region_code_learning_rate * factor, self.betas)?;
+        }
         metrics.push("gradient_norm", norms.first().copied().unwrap_or(0.0));
         Ok(metrics)
     }
@@ -282,6 +331,10 @@ impl StageRun for Warmup {
     fn save(&self, tensors: &mut Tensors) -> Result<()> {
         tensors.extend(self.generator.parameters().snapshot()?);
         tensors.insert(CODES.to_owned(), self.codes.as_tensor().clone());
+        // Before they are unlocked they are zeros, which a checkpoint need not hold.
+        if let Some(table) = self.region_codes.as_ref().filter(|table| table.is_touched()) {
+            table.save(REGION_CODES, tensors)?;
+        }
         self.optimiser.save("adam", tensors)
     }
 
@@ -292,6 +345,11 @@ impl StageRun for Warmup {
             return Err(Error::shape(CODES, self.codes.dims(), codes.dims()));
         }
         self.codes.set(&codes.to_device(&self.device)?)?;
+        if let Some(table) = &mut self.region_codes
+            && tensors.keys().any(|name| name.starts_with(REGION_CODES))
+        {
+            table.load(REGION_CODES, tensors)?;
+        }
         self.optimiser.load("adam", tensors)
     }
 
@@ -302,15 +360,14 @@ impl StageRun for Warmup {
             .iter()
             .map(|row| self.portraits.camera(Draw { index: *row as usize, mirrored: false }).unwrap_or_default())
             .collect();
-        let z = self.codes.as_tensor().index_select(&Tensor::from_vec(rows, count, &self.device)?, 0)?;
-        let trained = codes::broadcast(&self.generator.map(&z)?)?;
+        let trained = self.portrait_codes()?.codes(&self.generator, &rows)?;
         preview::grid(&self.finished()?.generator, &trained, &cameras)
     }
 
     fn finished(&self) -> Result<Start> {
         let generator = self.generator.duplicate()?;
         generator.measure(Some(self.codes.as_tensor()))?;
-        Ok(Start { generator, portrait_codes: Some(self.codes.as_tensor().copy()?.detach()) })
+        Ok(Start { generator, portrait_codes: Some(self.portrait_codes()?) })
     }
 }
 
