@@ -10,6 +10,8 @@ pub mod losses;
 pub mod optimiser;
 pub mod portrait_codes;
 pub mod preview;
+#[cfg(test)]
+mod test_data;
 pub mod trainer;
 pub mod upsampler_stage;
 pub mod warmup;

@@ -267,23 +267,39 @@ impl Generator {
     /// Lifts a render (or a crop of one) to the output resolution; without an upsampler the render is the picture.
     /// `global` drives an upsampler of one global code; without it the mean of the texture rows does.
     pub fn upsample(&self, frame: &Frame, codes: &Tensor, global: Option<&Tensor>) -> Result<UpsamplerOutput> {
-        let (Some(upsampler), Some(config)) = (&self.upsampler, &self.config.upsampler) else {
+        self.upsample_with(frame, codes, global, Noise::Stored)
+    }
+
+    /// As [`Self::upsample`], with other noise than the model's own.
+    pub fn upsample_with(
+        &self,
+        frame: &Frame,
+        codes: &Tensor,
+        global: Option<&Tensor>,
+        noise: Noise<'_>,
+    ) -> Result<UpsamplerOutput> {
+        let Some(upsampler) = &self.upsampler else {
             return Ok(UpsamplerOutput { rgb: frame.colour.clone(), masks: frame.masks.clone() });
         };
+        upsampler.forward(&Self::upsampler_input(frame)?, &self.upsampler_style(codes, global)?, noise)
+    }
+
+    /// What of a render the upsampler reads.
+    pub fn upsampler_input(frame: &Frame) -> Result<UpsamplerInput> {
         let features =
             frame.features.clone().ok_or_else(|| Error::config("features", "the upsampler needs them rendered"))?;
-        let input = UpsamplerInput {
-            colour: frame.colour.clone(),
-            masks: frame.masks.clone(),
-            features,
-            normal: frame.normal.clone(),
-        };
-        let style = match (config.style, global) {
+        let (colour, masks, normal) = (frame.colour.clone(), frame.masks.clone(), frame.normal.clone());
+        Ok(UpsamplerInput { colour, masks, features, normal })
+    }
+
+    /// What modulates the upsampler: the codes of all regions, or one code per portrait.
+    pub fn upsampler_style(&self, codes: &Tensor, global: Option<&Tensor>) -> Result<Tensor> {
+        let style = self.config.upsampler.as_ref().map_or(UpsamplerStyle::PerRegion, |config| config.style);
+        Ok(match (style, global) {
             (UpsamplerStyle::PerRegion, _) => codes.clone(),
             (UpsamplerStyle::Global, Some(global)) => global.clone(),
             (UpsamplerStyle::Global, None) => codes.narrow(2, 1, 1)?.squeeze(2)?.mean(1)?,
-        };
-        upsampler.forward(&input, &style, Noise::Stored)
+        })
     }
 
     /// Finished pictures of the portraits with `codes` `[B, 9, 2, D]` from `cameras` `[B, 6]`.

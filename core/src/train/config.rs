@@ -208,6 +208,10 @@ pub struct UpsamplerStageConfig {
     pub r1_mask: f64,
     /// Steps between R1 penalties. Authors: 16.
     pub r1_steps: usize,
+    /// Weight of path-length regularisation (`StyleGan2` upsamplers only). Authors: 2; 0 trains without it.
+    pub path_length: f64,
+    /// Steps between path-length penalties. Authors: 4.
+    pub path_length_steps: usize,
     /// As in the field's stage.
     pub average_half_life_images: f64,
 }
@@ -347,6 +351,8 @@ impl TrainConfig {
             r1_image: 10.0,
             r1_mask: 1_000.0,
             r1_steps: 16,
+            path_length: 2.0,
+            path_length_steps: 4,
             average_half_life_images: 10_000.0,
         }
     }

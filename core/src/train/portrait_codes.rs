@@ -95,7 +95,14 @@ impl RowTable {
     /// A table `[rows, shape…]` of zeros.
     pub fn zeros(rows: usize, shape: &[usize]) -> Self {
         let length = rows * shape.iter().product::<usize>();
-        Self { rows, shape: shape.to_vec(), values: vec![0.0; length], first: vec![0.0; length], second: vec![0.0; length], step: 0 }
+        Self {
+            rows,
+            shape: shape.to_vec(),
+            values: vec![0.0; length],
+            first: vec![0.0; length],
+            second: vec![0.0; length],
+            step: 0,
+        }
     }
 
     /// Takes over the values of `tensor`, `[rows, shape…]`.
@@ -203,7 +210,10 @@ impl RowTable {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{model::file::Tensors, train::optimiser::{Adam, Group}};
+    use crate::{
+        model::file::Tensors,
+        train::optimiser::{Adam, Group},
+    };
 
     const BETAS: Betas = Betas { first: 0.9, second: 0.99 };
 
@@ -216,7 +226,8 @@ mod tests {
     fn with_every_row_in_every_step_it_is_adam() {
         let mut table = RowTable::zeros(3, &[2]);
         let dense = Var::zeros((3, 2), candle_core::DType::F32, &Device::Cpu).unwrap();
-        let group = Group { variables: vec![("x".into(), dense.clone())], learning_rate: 0.1, largest_gradient_norm: None };
+        let group =
+            Group { variables: vec![("x".into(), dense.clone())], learning_rate: 0.1, largest_gradient_norm: None };
         let mut adam = Adam::new(vec![group], BETAS);
         for _ in 0..40 {
             let rows = [2, 0, 1];

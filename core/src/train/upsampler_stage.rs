@@ -22,13 +22,13 @@ use crate::{
         discriminator::{Discriminator, DiscriminatorConfig, DiscriminatorKind},
         file::Tensors,
         generator::Generator,
-        upsampler::UpsamplerOutput,
+        upsampler::{Noise, Upsampler, UpsamplerOutput},
     },
     parameters::Parameters,
     render::{Frame, RenderSettings, TwoPass},
     rng::Stream,
     train::{
-        adversarial::{Auxiliary, Pictures, R1Weights, discriminator_loss, generator_terms},
+        adversarial::{Auxiliary, PathLength, Pictures, R1Weights, discriminator_loss, generator_terms},
         average::Average,
         config::{TrainConfig, UpsamplerStageConfig},
         events::Metrics,
@@ -46,6 +46,12 @@ const STREAM: u64 = 0x7570_7361;
 const MOST_KEPT: usize = 2_500;
 /// LPIPS sees each crop shifted by up to this, pixels: AlexNet's stride of 4 with crops on even offsets draws stripes.
 const LARGEST_SHIFT: usize = 3;
+/// Path lengths are measured on a batch smaller by this (authors).
+const PATH_BATCH_SHRINK: usize = 2;
+/// Share of a new batch in the running mean of path lengths (authors).
+const PATH_DECAY: f64 = 0.01;
+/// Name of that mean in checkpoints.
+const PATH_MEAN: &str = "path_length_mean";
 
 /// The running stage.
 pub struct UpsamplerStage {
@@ -56,6 +62,8 @@ pub struct UpsamplerStage {
     average: Average,
     perceptual: Option<Perceptual>,
     optimiser: Adam,
+    /// Running mean of path lengths, a scalar.
+    path_mean: Tensor,
     paired: Option<Paired>,
     adversary: Option<Adversary>,
 }
@@ -150,6 +158,7 @@ impl UpsamplerStage {
             generator,
             perceptual: inputs.perceptual.clone(),
             optimiser,
+            path_mean: Tensor::zeros((), DType::F32, &inputs.device)?,
             paired,
             adversary,
         })
@@ -231,18 +240,46 @@ impl UpsamplerStage {
         Ok((terms.total * config.adversarial)?)
     }
 
-    /// Finished pictures of random portraits from random cameras; the field gets no gradient.
-    fn random_pictures(&self, random: &mut Stream) -> Result<UpsamplerOutput> {
-        let batch = self.config.batch;
-        let z = random.normal_tensor(&[batch, self.generator.config().field.style_dim], &self.device)?;
+    /// Path-length regularisation (StyleGAN2): a step in w moves the picture by about the same amount everywhere.
+    fn path_length(&mut self, step: usize, metrics: &mut Metrics) -> Result<Option<Tensor>> {
+        let config = &self.config;
+        let every = config.path_length_steps.max(1);
+        if config.adversarial == 0.0 || config.path_length == 0.0 || !step.is_multiple_of(every) {
+            return Ok(None);
+        }
+        // Only StyleGAN2's synthesis has a graph from latents to picture laid down.
+        let Some(Upsampler::StyleGan2(network)) = self.generator.upsampler() else { return Ok(None) };
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64, 2]);
+        let (frame, codes) = self.random_renders((config.batch / PATH_BATCH_SHRINK).max(1), &mut random)?;
+        let input = Generator::upsampler_input(&frame)?;
+        let latents = network.latents(&self.generator.upsampler_style(&codes, None)?)?;
+        let features = network.transfer_features(&input.features)?;
+        let noise = Noise::Drawn(&mut random);
+        let (output, trace) = network.synthesize_from(&features, &input.masks, &latents, noise)?;
+        let pixels = (output.rgb.dim(2)? * output.rgb.dim(3)?) as f64;
+        let direction = (random.normal_tensor(output.rgb.dims(), &self.device)? / pixels.sqrt())?;
+        let path = PathLength::new(&network.latent_gradient(&trace, &direction)?, &self.path_mean, PATH_DECAY)?;
+        metrics.push("path_length", scalar(&path.penalty)?);
+        self.path_mean = path.mean;
+        Ok(Some((path.penalty * (config.path_length * every as f64))?))
+    }
+
+    /// Renders of random portraits from random cameras, and their codes; the field gets no gradient.
+    fn random_renders(&self, count: usize, random: &mut Stream) -> Result<(Frame, Tensor)> {
+        let z = random.normal_tensor(&[count, self.generator.config().field.style_dim], &self.device)?;
         let codes = codes::broadcast(&self.generator.map(&self.generator.spread(&z)?)?.detach())?;
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
-        let cameras: Vec<Camera> = (0..batch)
+        let cameras: Vec<Camera> = (0..count)
             .map(|_| Camera::at(f64::from(random.normal()) * azimuth, f64::from(random.normal()) * elevation))
             .collect();
         let cameras = Camera::parameter_tensor(&cameras, &self.device)?;
-        let frame = self.generator.render(&codes, &cameras, &self.generator.render_settings())?;
-        self.generator.upsample(&frame, &codes, None)
+        Ok((self.generator.render(&codes, &cameras, &self.generator.render_settings())?, codes))
+    }
+
+    /// Finished pictures of random portraits from random cameras.
+    fn random_pictures(&self, random: &mut Stream) -> Result<UpsamplerOutput> {
+        let (frame, codes) = self.random_renders(self.config.batch, random)?;
+        self.generator.upsample_with(&frame, &codes, None, Noise::Drawn(random))
     }
 }
 
@@ -325,7 +362,11 @@ impl FrameBatch {
 impl StageRun for UpsamplerStage {
     fn step(&mut self, step: usize) -> Result<Metrics> {
         let mut metrics = Metrics::default();
-        let losses = [self.paired_loss(step, &mut metrics)?, self.adversarial_loss(step, &mut metrics)?];
+        let losses = [
+            self.paired_loss(step, &mut metrics)?,
+            self.adversarial_loss(step, &mut metrics)?,
+            self.path_length(step, &mut metrics)?,
+        ];
         let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
         let total =
             total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
@@ -340,6 +381,7 @@ impl StageRun for UpsamplerStage {
     fn save(&self, tensors: &mut Tensors) -> Result<()> {
         tensors.extend(self.generator.parameters().snapshot()?);
         self.average.save(tensors);
+        tensors.insert(PATH_MEAN.to_owned(), self.path_mean.reshape(1)?);
         if let Some(adversary) = &self.adversary {
             tensors.extend(adversary.parameters.snapshot()?);
             adversary.optimiser.save("adam_discriminator", tensors)?;
@@ -350,6 +392,8 @@ impl StageRun for UpsamplerStage {
     fn load(&mut self, tensors: &Tensors) -> Result<()> {
         self.generator.parameters().restore(tensors)?;
         self.average.load(tensors)?;
+        let mean = tensors.get(PATH_MEAN).ok_or_else(|| Error::shape(PATH_MEAN, [1], &[]))?;
+        self.path_mean = mean.to_device(&self.device)?.reshape(())?;
         if let Some(adversary) = &mut self.adversary {
             adversary.parameters.restore(tensors)?;
             adversary.optimiser.load("adam_discriminator", tensors)?;
