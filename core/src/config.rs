@@ -84,7 +84,7 @@ pub struct FilmConfig {
 pub struct FieldConfig {
     /// Length of one code row. Paper 256; recipe 128.
     pub style_dim: usize,
-    /// Width of every local generator's layers. Paper 128; recipe 48.
+    /// Width of every local generator's layers. Paper 128; recipe 48; ours 64.
     pub width: usize,
     /// FiLM's affine constants.
     pub film: FilmConfig,
@@ -130,11 +130,11 @@ impl FieldConfig {
         }
     }
 
-    /// Our form at the recipe's sizes.
+    /// Our form, CPU-sized.
     pub fn ours() -> Self {
         Self {
             style_dim: 128,
-            width: 48,
+            width: 64,
             film: FilmConfig { gamma_gain: 7.5, gamma_offset: 15.0, beta_gain: 0.25 },
             residual: Residual::Gated,
             fusion: Fusion::Softmax { sharpness: 4.0 },

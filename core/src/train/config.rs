@@ -69,7 +69,7 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WarmupConfig {
-    /// Optimiser steps; the recipe's nine minutes were 2,147.
+    /// Optimiser steps; the recipe's nine minutes were 2,147, the built-in portrait model's 50 were 16,000.
     pub steps: usize,
     /// Portraits a step.
     pub batch: usize,
@@ -239,14 +239,14 @@ impl TrainConfig {
             log_steps: 20,
             model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 12 },
             warmup: WarmupConfig {
-                steps: 4_000,
+                steps: 16_000,
                 batch: 32,
                 rays: 48,
                 samples: 10,
                 depth_range: [0.895, 1.10],
                 learning_rate: 1e-3,
                 code_learning_rate: 3e-3,
-                region_codes_from: 0.5,
+                region_codes_from: 0.55,
                 region_code_learning_rate: 1e-2,
                 schedule: Schedule { warmup_steps: 100, hold: 0.3, floor: 0.03 },
                 betas: [0.9, 0.99],
