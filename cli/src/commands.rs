@@ -4,6 +4,7 @@
 mod convert;
 mod dataset;
 mod edit;
+mod eval;
 mod export;
 mod generate;
 mod info;
@@ -49,6 +50,9 @@ enum Command {
     Render(render::RenderArguments),
     /// Write a portrait's surface as a mesh
     Export(export::ExportArguments),
+    /// Measure a model, or portraits, against held-out data
+    #[command(subcommand)]
+    Eval(eval::EvalCommand),
     /// Read the authors' PyTorch checkpoints
     Convert(convert::ConvertArguments),
     /// Say what a model, portrait or dataset holds
@@ -71,6 +75,7 @@ pub fn run(arguments: Arguments, console: &Console) -> anyhow::Result<Outcome> {
         Command::Edit(edit) => edit.run(seed, console),
         Command::Render(render) => render.run(seed, console),
         Command::Export(export) => export.run(console),
+        Command::Eval(eval) => eval.run(seed.unwrap_or(0), console),
         Command::Convert(convert) => convert.run(console),
         Command::Info(info) => info.run(console),
         Command::Completions(completions) => completions.run(),

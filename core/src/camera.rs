@@ -103,6 +103,18 @@ impl Camera {
         (matrix.map(|row| row[3]), direction)
     }
 
+    /// Where a world point lies in the picture: x and y as in [`Self::ray`], and its depth along the view axis. None
+    /// for a point that is not in front of the camera.
+    pub fn project(&self, point: [f64; 3]) -> Option<([f64; 2], f64)> {
+        let matrix = self.world_from_camera();
+        let [x, y, z] = std::array::from_fn(|axis| {
+            matrix.iter().zip(point).map(|(row, value)| row[axis] * (value - row[3])).sum::<f64>()
+        });
+        let depth = -z;
+        let scale = depth * (0.5 * self.field_of_view_rad).tan() / self.zoom;
+        (scale > 1e-9).then(|| ([x / scale + self.shift_x, y / scale + self.shift_y], depth))
+    }
+
     /// The parameter vectors of `cameras` as a tensor `[B, 6]`, f32.
     pub fn parameter_tensor(cameras: &[Self], device: &Device) -> Result<Tensor> {
         let values: Vec<f32> =
@@ -170,6 +182,16 @@ mod tests {
                 assert!((dot - f64::from(u8::from(left == right))).abs() < 1e-12);
             }
         }
+    }
+
+    #[test]
+    fn projection_undoes_the_ray() {
+        let camera = Camera { roll_rad: 0.2, shift_x: 0.1, shift_y: -0.05, zoom: 1.3, ..Camera::at(0.4, -0.2) };
+        let (origin, direction) = camera.ray(0.3, -0.7);
+        let point = std::array::from_fn(|axis| origin[axis] + 0.97 * direction[axis]);
+        let ([x, y], depth) = camera.project(point).unwrap();
+        assert!((x - 0.3).abs() < 1e-12 && (y + 0.7).abs() < 1e-12 && (depth - 0.97).abs() < 1e-12);
+        assert_eq!(camera.project(std::array::from_fn(|axis| origin[axis] - direction[axis])), None);
     }
 
     #[test]

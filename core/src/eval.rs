@@ -1,4 +1,13 @@
-//! Measures: pixel and perceptual distances, mask agreement, locality of edits.
+//! Measures: pixel and perceptual distances, mask agreement, how like real portraits random ones are, whether views
+//! agree, locality of edits.
 
+pub mod consistency;
+pub mod distribution;
+pub mod features;
+pub mod locality;
 pub mod perceptual;
 pub mod quality;
+pub mod realism;
+pub mod spectrum;
+pub mod subject;
+pub mod warp;

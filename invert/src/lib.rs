@@ -6,6 +6,7 @@ pub mod config;
 pub mod detect;
 pub mod edit;
 pub mod error;
+pub mod evaluation;
 pub mod events;
 pub mod inverter;
 pub mod objective;

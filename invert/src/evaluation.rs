@@ -1,0 +1,558 @@
+//! How well photos are inverted: held-out people, none of whose regions, camera or other views the inverter is told
+//! unless asked, measured against what the data set knows of them.
+
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use candle_core::{DType, Device, Tensor};
+use cnerf_core::{
+    camera::Camera,
+    data::{
+        dataset::{Dataset, Item},
+        labels::LabelMap,
+        picture,
+    },
+    eval::{
+        consistency::correlation,
+        perceptual::Perceptual,
+        quality::{self, Agreement},
+        warp::{Raster, Surface},
+    },
+    model::{file, generator::Generator},
+    region::Region,
+    rng::Stream,
+};
+use image::RgbImage;
+use serde::Serialize;
+
+use crate::{
+    align,
+    config::InvertConfig,
+    error::{Error, Result},
+    events::Event,
+    inverter::{Inverter, Opened},
+    photo::{PhotoOptions, Subject},
+};
+
+/// The first element of every stream drawn here.
+const STREAM: u64 = 0x6576_616c;
+/// Photos in a folder that is no data set are told by these.
+const EXTENSIONS: [&str; 5] = ["png", "jpg", "jpeg", "webp", "bmp"];
+
+/// Which inversion is measured: the rows of an ablation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+#[serde(rename_all = "lowercase")]
+pub enum Variant {
+    /// Codes and camera alone; the model stays as it is.
+    Pivot,
+    /// Pivotal tuning as published: every layer at one rate, nothing holds depth at other views.
+    Plain,
+    /// Tuning with slow geometry and depth held at other views.
+    #[default]
+    Ours,
+}
+
+impl Variant {
+    /// `config` with the parts of this variant.
+    #[must_use]
+    pub fn apply(self, mut config: InvertConfig) -> InvertConfig {
+        match self {
+            Self::Pivot => config.tune_steps = Some(0),
+            Self::Plain => {
+                config.tune.depth = 0.0;
+                config.tune.geometry_rate = config.tune.texture_rate;
+            }
+            Self::Ours => {}
+        }
+        config
+    }
+
+    /// The name in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Pivot => "pivot",
+            Self::Plain => "plain",
+            Self::Ours => "ours",
+        }
+    }
+}
+
+/// What an evaluation tells the inverter, and how it inverts.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EvaluationOptions {
+    /// How to invert, before [`Variant::apply`].
+    pub config: InvertConfig,
+    /// What to measure.
+    pub variant: Variant,
+    /// The model's name in the portraits.
+    pub model_name: String,
+    /// Give the data set's camera and keep it.
+    pub known_pose: bool,
+    /// Give the data set's region masks.
+    pub known_masks: bool,
+}
+
+/// Who is inverted: the people of a data set, each with all views there are, or the photos of a folder.
+pub struct People {
+    source: Source,
+}
+
+enum Source {
+    /// Items of each person; the first is inverted.
+    Dataset {
+        dataset: Box<Dataset>,
+        people: Vec<Vec<usize>>,
+    },
+    Photos(Vec<PathBuf>),
+}
+
+/// Another view of a person.
+struct OtherView {
+    camera: Camera,
+    image: RgbImage,
+    labels: Option<LabelMap>,
+}
+
+/// One person: what is inverted, and what is known.
+struct Person {
+    name: String,
+    subject: Subject,
+    camera: Option<Camera>,
+    labels: Option<LabelMap>,
+    /// Depth along the view axis, world units.
+    depth: Option<Raster>,
+    others: Vec<OtherView>,
+}
+
+impl People {
+    /// The data set at `path`, else the photos in it; at most `count` people, drawn from `seed`.
+    ///
+    /// Items of a data set that share a field `head` (`cnerf synth --views`) are views of one person.
+    ///
+    /// # Errors
+    /// If `path` is neither, or holds nobody.
+    pub fn open(path: &Path, count: usize, seed: u64) -> Result<Self> {
+        let mut random = Stream::new(seed, &[STREAM]);
+        if path.is_dir() && !path.join("dataset.json").is_file() {
+            let mut photos = list_photos(path)?;
+            let order = random.permutation(photos.len());
+            photos = order.into_iter().take(count).filter_map(|index| photos.get(index).cloned()).collect();
+            if photos.is_empty() {
+                let reason = "holds neither dataset.json nor photos (png, jpg, webp, bmp)";
+                return Err(Error::malformed(path, reason));
+            }
+            return Ok(Self { source: Source::Photos(photos) });
+        }
+        let dataset = Dataset::open(path)?;
+        let mut people: Vec<(Option<u64>, Vec<usize>)> = Vec::new();
+        for (index, entry) in dataset.entries().iter().enumerate() {
+            let head = entry.extra.get("head").and_then(|head| head.as_u64());
+            match people.iter_mut().find(|(other, _)| head.is_some() && *other == head) {
+                Some((_, items)) => items.push(index),
+                None => people.push((head, vec![index])),
+            }
+        }
+        if people.is_empty() {
+            return Err(Error::malformed(path, "holds no portraits"));
+        }
+        let order = random.permutation(people.len());
+        let people = order.into_iter().take(count).filter_map(|index| Some(people.get(index)?.1.clone())).collect();
+        Ok(Self { source: Source::Dataset { dataset: Box::new(dataset), people } })
+    }
+
+    /// Number of people.
+    pub fn len(&self) -> usize {
+        match &self.source {
+            Source::Dataset { people, .. } => people.len(),
+            Source::Photos(photos) => photos.len(),
+        }
+    }
+
+    /// Whether there is nobody.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The name of a person's photo.
+    pub fn name(&self, index: usize) -> String {
+        match &self.source {
+            Source::Photos(photos) => photos.get(index).map(|path| path.display().to_string()),
+            Source::Dataset { dataset, people } => people
+                .get(index)
+                .and_then(|items| dataset.entries().get(*items.first()?))
+                .map(|entry| entry.image.clone()),
+        }
+        .unwrap_or_default()
+    }
+
+    /// Reads one person at `side` x `side` pixels.
+    fn read(&self, index: usize, side: u32, options: &EvaluationOptions) -> Result<Person> {
+        let name = self.name(index);
+        let (dataset, items) = match &self.source {
+            Source::Photos(photos) => {
+                let path = photos.get(index).ok_or_else(|| Error::config("--count", "beyond the photos there are"))?;
+                let subject = Subject::read(path, &PhotoOptions::default(), None, side)?;
+                return Ok(Person { name, subject, camera: None, labels: None, depth: None, others: Vec::new() });
+            }
+            Source::Dataset { dataset, people } => {
+                (dataset, people.get(index).ok_or_else(|| Error::config("--count", "beyond the people there are"))?)
+            }
+        };
+        let (first, rest) = items.split_first().ok_or_else(|| Error::config("--data", "a person without photos"))?;
+        let Item { image, mask, camera } = dataset.item(*first)?;
+        let labels = mask.map(|mask| mask.resized(side, side)).transpose()?;
+        let mut aligned = align::already_aligned(&image, side)?;
+        if options.known_pose {
+            aligned.camera = camera
+                .ok_or_else(|| Error::config("--known-pose", format!("{name}: the data set names no camera for it")))?;
+        }
+        let known = if options.known_masks { labels.clone() } else { None };
+        if options.known_masks && known.is_none() {
+            return Err(Error::config("--known-masks", format!("{name}: the data set has no mask of it")));
+        }
+        let subject = Subject { source: name.clone(), aligned, labels: known, warnings: Vec::new() };
+        let other = |index: &usize| -> Result<Option<OtherView>> {
+            let Item { image, mask, camera } = dataset.item(*index)?;
+            let Some(camera) = camera else { return Ok(None) };
+            let labels = mask.map(|mask| mask.resized(side, side)).transpose()?;
+            Ok(Some(OtherView { camera, image: picture::resize(&image, side, side)?, labels }))
+        };
+        let others = rest.iter().filter_map(|index| other(index).transpose()).collect::<Result<_>>()?;
+        Ok(Person { name, subject, camera, labels, depth: known_depth(dataset, *first)?, others })
+    }
+}
+
+fn list_photos(folder: &Path) -> Result<Vec<PathBuf>> {
+    let failed = |error| cnerf_core::Error::io(folder, error);
+    let mut photos = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        let extension = path.extension().map(|extension| extension.to_string_lossy().to_ascii_lowercase());
+        if path.is_file() && extension.is_some_and(|extension| EXTENSIONS.contains(&extension.as_str())) {
+            photos.push(path);
+        }
+    }
+    photos.sort();
+    Ok(photos)
+}
+
+/// The depth that `cnerf synth --with depth` left beside an item.
+fn known_depth(dataset: &Dataset, index: usize) -> Result<Option<Raster>> {
+    let Some(name) = dataset.entry(index)?.extra.get("depth").and_then(|name| name.as_str()) else {
+        return Ok(None);
+    };
+    let path = dataset.path().join(name);
+    let (tensors, _) = file::parse_safetensors(&path, &dataset.file(name)?)?;
+    let depth = tensors.get("depth").filter(|depth| depth.rank() == 2);
+    let depth = depth.ok_or_else(|| Error::malformed(&path, "holds no tensor `depth` [S, S]"))?;
+    Ok(Some(Raster::from_tensor(&depth.unsqueeze(0)?.unsqueeze(0)?)?))
+}
+
+/// What one inversion gave.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct InversionScore {
+    /// The photo.
+    pub input: String,
+    /// Wall time, everything included.
+    pub seconds: f64,
+    /// Of the photo's own view, dB.
+    pub psnr: f64,
+    /// Of the photo's own view.
+    pub ms_ssim: f64,
+    /// Perceptual distance, if weights were given.
+    pub lpips: Option<f64>,
+    /// Mean IoU of the rendered regions, if the data has masks.
+    pub mask_miou: Option<f64>,
+    /// Mean PSNR at the person's other views, dB, if there are any.
+    pub novel_view_psnr: Option<f64>,
+    /// The same without the background.
+    pub novel_view_foreground_psnr: Option<f64>,
+    /// Each of those views.
+    pub novel_views: Vec<NovelView>,
+    /// Correlation with the true depth of the head in the photo's view, if the data has it.
+    pub depth_correlation: Option<f64>,
+    /// Angle between the found and the true direction of view, radians, if the data names it.
+    pub pose_error_rad: Option<f64>,
+    /// How far tuning moved the depth at other views, world units.
+    pub depth_drift: f64,
+    /// PSNR over the time spent: (seconds, dB), of what each optimiser step compared.
+    #[serde(skip)]
+    pub curve: Vec<(f64, f64)>,
+}
+
+/// A view that the inverter was not shown.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct NovelView {
+    /// How far its azimuth is from the photo's, radians.
+    pub azimuth_turn_rad: f64,
+    /// How far its elevation is from the photo's, radians.
+    pub elevation_turn_rad: f64,
+    /// dB.
+    pub psnr: f64,
+    /// Without the background, dB; none without masks.
+    pub foreground_psnr: Option<f64>,
+}
+
+/// Inverts one of `people` and measures the result. `step` is called after every optimiser step with those done and
+/// those there are in all.
+///
+/// Other views are rendered from the found camera turned by as much as the true cameras are apart: an error of the
+/// pose is counted as such and not again at every view.
+pub fn invert_one(
+    generator: &Generator,
+    people: &People,
+    index: usize,
+    perceptual: Option<&Perceptual>,
+    options: &EvaluationOptions,
+    step: &mut dyn FnMut(usize, usize),
+) -> Result<InversionScore> {
+    let began = Instant::now();
+    let side = generator.output_resolution() as u32;
+    let person = people.read(index, side, options)?;
+    let read_seconds = began.elapsed().as_secs_f64();
+    let photo = person.subject.aligned.picture.clone();
+    let mut config = options.variant.apply(options.config.clone());
+    config.fixed_camera |= options.known_pose;
+    let steps = config.steps();
+    // What was read of other views is no part of inverting a photo, but as nothing beside the optimisation.
+    let started = Instant::now();
+    let mut inverter = Inverter::new(generator, &options.model_name, person.subject.clone(), config, perceptual)?;
+    let (mut done, mut curve) = (0, Vec::new());
+    while let Some(event) = inverter.step()? {
+        if let Event::Pivot(report) | Event::Tune(report) = event {
+            done += 1;
+            curve.push((read_seconds + started.elapsed().as_secs_f64(), report.psnr));
+            step(done, steps.pivot() + steps.tune);
+        }
+    }
+    let portrait = inverter.finish()?.portrait;
+    let seconds = read_seconds + started.elapsed().as_secs_f64();
+    let opened = Opened::new(&portrait, Path::new(&person.name), generator)?;
+    let metrics = portrait.metrics;
+    let mut score = InversionScore {
+        input: person.name.clone(),
+        seconds,
+        psnr: metrics.psnr,
+        ms_ssim: metrics.ms_ssim,
+        lpips: metrics.lpips,
+        depth_drift: metrics.depth_drift,
+        curve,
+        ..InversionScore::default()
+    };
+    measure(&person, &photo, &opened, &mut score)?;
+    Ok(score)
+}
+
+fn measure(person: &Person, photo: &RgbImage, opened: &Opened, score: &mut InversionScore) -> Result<()> {
+    let camera = opened.camera;
+    let picture = opened.picture(&camera)?;
+    if let Some(labels) = &person.labels {
+        let mut agreement = Agreement::default();
+        let found = LabelMap::from_masks(&picture.masks.squeeze(0)?)?;
+        agreement.add(&labels.resized(found.width(), found.height())?, &found)?;
+        score.mask_miou = agreement.mean_iou();
+    }
+    if let Some(truth) = &person.camera {
+        score.pose_error_rad = Some(angle_between(truth, &camera));
+    }
+    if let Some(depth) = &person.depth {
+        let surface = Surface::new(camera, &picture.frame)?;
+        score.depth_correlation = depth_correlation(depth, person.labels.as_ref(), &surface, photo.width());
+    }
+    let Some(truth) = person.camera else { return Ok(()) };
+    for other in &person.others {
+        let (azimuth_turn_rad, elevation_turn_rad) =
+            (other.camera.azimuth_rad - truth.azimuth_rad, other.camera.elevation_rad - truth.elevation_rad);
+        let turned = Camera {
+            azimuth_rad: camera.azimuth_rad + azimuth_turn_rad,
+            elevation_rad: camera.elevation_rad + elevation_turn_rad,
+            ..camera
+        };
+        let found = opened.picture(&turned)?.rgb.clamp(-1.0, 1.0)?;
+        let expected = picture::to_tensor(std::slice::from_ref(&other.image), found.device())?;
+        let psnr = quality::psnr(&found, &expected)?.first().copied().unwrap_or_default();
+        let foreground = other.labels.as_ref().map(|labels| foreground(labels, found.device())).transpose()?;
+        let foreground_psnr = match foreground {
+            Some(weights) => quality::psnr_within(&found, &expected, &weights)?.first().copied().flatten(),
+            None => None,
+        };
+        score.novel_views.push(NovelView { azimuth_turn_rad, elevation_turn_rad, psnr, foreground_psnr });
+    }
+    score.novel_view_psnr = mean(score.novel_views.iter().map(|view| view.psnr));
+    score.novel_view_foreground_psnr = mean(score.novel_views.iter().filter_map(|view| view.foreground_psnr));
+    Ok(())
+}
+
+/// 1 where a label map shows the person, `[1, 1, S, S]`.
+fn foreground(labels: &LabelMap, device: &Device) -> Result<Tensor> {
+    let background = Region::Background.index() as u8;
+    let shown = labels.labels().iter().map(|label| f32::from(u8::from(*label != background))).collect::<Vec<_>>();
+    let shape = (1, 1, labels.height() as usize, labels.width() as usize);
+    Ok(Tensor::from_vec(shown, shape, device)?.to_dtype(DType::F32)?)
+}
+
+/// Over the pixels of a picture of `side` x `side` that show the head in both.
+fn depth_correlation(truth: &Raster, labels: Option<&LabelMap>, found: &Surface, side: u32) -> Option<f64> {
+    let background = Region::Background.index() as u8;
+    let pixels = (0..(side * side) as usize).filter_map(|index| {
+        let at = |place: usize| (2 * place + 1) as f64 / f64::from(side) - 1.0;
+        let point = [at(index % side as usize), -at(index / side as usize)];
+        if labels.is_some_and(|labels| labels.labels().get(index).is_none_or(|label| *label == background)) {
+            return None;
+        }
+        let expected = *truth.channels().first()?.get(truth.nearest(point))?;
+        (expected < cnerf_core::camera::FAR - 1e-6).then_some(())?;
+        Some((expected, found.depth(point)?))
+    });
+    correlation(pixels)
+}
+
+/// The angle between two cameras' directions of view, radians.
+fn angle_between(a: &Camera, b: &Camera) -> f64 {
+    let direction = |camera: &Camera| camera.world_from_camera().map(|row| row[2]);
+    let cosine: f64 = direction(a).iter().zip(direction(b)).map(|(a, b)| a * b).sum();
+    cosine.clamp(-1.0, 1.0).acos()
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (sum, count) = values.fold((0.0, 0usize), |(sum, count), value| (sum + value, count + 1));
+    (count > 0).then(|| sum / count as f64)
+}
+
+/// The means of several inversions.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct InversionSummary {
+    /// Photos inverted.
+    pub count: usize,
+    /// Photos that could not be.
+    pub failed: usize,
+    /// See [`InversionScore`], and so below.
+    pub seconds: f64,
+    /// dB.
+    pub psnr: f64,
+    /// 0 to 1.
+    pub ms_ssim: f64,
+    /// If weights were given.
+    pub lpips: Option<f64>,
+    /// If the data has masks.
+    pub mask_miou: Option<f64>,
+    /// dB, if the data has other views.
+    pub novel_view_psnr: Option<f64>,
+    /// dB, without the background.
+    pub novel_view_foreground_psnr: Option<f64>,
+    /// If the data has depth.
+    pub depth_correlation: Option<f64>,
+    /// Radians, if the data has cameras.
+    pub pose_error_rad: Option<f64>,
+    /// World units.
+    pub depth_drift: f64,
+}
+
+impl InversionSummary {
+    /// The means of `scores`; what a photo lacks is left out of the mean.
+    pub fn of(scores: &[InversionScore], failed: usize) -> Self {
+        let of = |value: fn(&InversionScore) -> Option<f64>| mean(scores.iter().filter_map(value));
+        Self {
+            count: scores.len(),
+            failed,
+            seconds: of(|score| Some(score.seconds)).unwrap_or_default(),
+            psnr: of(|score| Some(score.psnr)).unwrap_or_default(),
+            ms_ssim: of(|score| Some(score.ms_ssim)).unwrap_or_default(),
+            lpips: of(|score| score.lpips),
+            mask_miou: of(|score| score.mask_miou),
+            novel_view_psnr: of(|score| score.novel_view_psnr),
+            novel_view_foreground_psnr: of(|score| score.novel_view_foreground_psnr),
+            depth_correlation: of(|score| score.depth_correlation),
+            pose_error_rad: of(|score| score.pose_error_rad),
+            depth_drift: of(|score| Some(score.depth_drift)).unwrap_or_default(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cnerf_core::data::{
+        cartoon::{RenderOptions, SynthOptions, synth},
+        dataset::{DatasetWriter, EncodedItem, PhotoFormat},
+    };
+
+    use super::*;
+    use crate::inverter::tests::small_generator;
+
+    /// Two cartoon heads of three views each, with depth, in an order that mixes them.
+    fn dataset(path: &Path) {
+        let options = SynthOptions { count: 2, size: 64, views: 3, ..SynthOptions::default() };
+        let mut items: Vec<_> = synth(1, options, RenderOptions::default()).unwrap().collect();
+        items.swap(1, 3);
+        let mut writer = DatasetWriter::create(path, false).unwrap();
+        for item in items {
+            let picture = &item.picture;
+            let rgb = RgbImage::from_raw(64, 64, picture.rgb.clone()).unwrap();
+            let labels = LabelMap::new(64, 64, picture.labels.clone()).unwrap();
+            let depth = Tensor::from_slice(&picture.depth, (64, 64), &Device::Cpu).unwrap();
+            let bytes =
+                file::safetensors_bytes(Path::new("depth"), &file::Tensors::from([("depth".to_owned(), depth)]), &[]);
+            let encoded = EncodedItem::new(&rgb, Some(&labels), Some(item.camera), PhotoFormat::Png).unwrap();
+            writer.add(encoded.with("head", item.head).attach("depth", "safetensors", bytes.unwrap())).unwrap();
+        }
+        writer.finish().unwrap();
+    }
+
+    #[test]
+    fn views_of_one_head_are_one_person_and_the_other_views_are_measured() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("data");
+        dataset(&path);
+        let people = People::open(&path, 10, 0).unwrap();
+        assert_eq!(people.len(), 2);
+        let generator = small_generator(3);
+        let config = InvertConfig { pivot_steps: Some(3), tune_steps: Some(1), ..InvertConfig::default() };
+        let options = EvaluationOptions { config, known_pose: true, known_masks: true, ..EvaluationOptions::default() };
+        let mut steps = Vec::new();
+        let score = invert_one(&generator, &people, 0, None, &options, &mut |done, all| steps.push((done, all)));
+        let score = score.unwrap();
+        assert_eq!(steps, [(1, 4), (2, 4), (3, 4), (4, 4)]);
+        assert_eq!((score.novel_views.len(), score.curve.len()), (2, 4));
+        // A known pose is kept, to f32.
+        assert!(score.pose_error_rad.unwrap() < 1e-3, "{score:?}");
+        assert!(score.psnr > 1.0 && score.novel_view_psnr.unwrap() > 1.0 && score.mask_miou.unwrap() > 0.0);
+        assert!(score.depth_correlation.is_some_and(|found| (-1.0..=1.0).contains(&found)), "{score:?}");
+        let pivot = EvaluationOptions { variant: Variant::Pivot, ..options };
+        let mut count = 0;
+        let again = invert_one(&generator, &people, 0, None, &pivot, &mut |_, _| count += 1).unwrap();
+        assert_eq!((count, again.depth_drift), (3, 0.0));
+
+        let summary = InversionSummary::of(&[score.clone(), again.clone()], 1);
+        assert_eq!((summary.count, summary.failed, summary.lpips), (2, 1, None));
+        assert!((summary.psnr - 0.5 * (score.psnr + again.psnr)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn variants_differ_in_what_holds_geometry() {
+        let config = InvertConfig::default();
+        assert_eq!(Variant::Ours.apply(config.clone()), config);
+        assert_eq!(Variant::Pivot.apply(config.clone()).steps().tune, 0);
+        let plain = Variant::Plain.apply(config);
+        assert_eq!((plain.tune.depth, plain.tune.geometry_rate), (0.0, plain.tune.texture_rate));
+    }
+
+    #[test]
+    fn pose_errors_are_angles_of_view_whatever_the_roll() {
+        let angle = angle_between(&Camera::at(0.1, 0.0), &Camera { roll_rad: 1.0, ..Camera::at(0.4, 0.0) });
+        assert!((angle - 0.3).abs() < 1e-9, "{angle}");
+    }
+
+    #[test]
+    fn folders_without_anybody_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = People::open(folder.path(), 1, 0).err().unwrap().to_string();
+        assert!(error.contains("dataset.json") && error.contains("photos"), "{error}");
+        for name in ["b.PNG", "a.jpg", "notes.txt"] {
+            std::fs::write(folder.path().join(name), b"x").unwrap();
+        }
+        assert_eq!(People::open(folder.path(), 10, 0).unwrap().len(), 2);
+    }
+}
