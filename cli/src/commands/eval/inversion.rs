@@ -106,7 +106,8 @@ impl InversionArguments {
         }
         let Some(first) = variants.first() else { bail!("--variant: name at least one") };
         if variants.iter().all(|measured| measured.portraits.is_empty()) {
-            bail!("none of {} photos could be inverted: {}", people.len(), first.failures[0].error);
+            let reason = first.failures.first().map_or("", |failure| failure.error.as_str());
+            bail!("none of {} photos could be inverted: {reason}", people.len());
         }
         self.draw(&variants)?;
         let partial = variants.iter().any(|measured| !measured.failures.is_empty());
