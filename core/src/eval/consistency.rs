@@ -23,7 +23,7 @@ const LEAST_PIXELS: usize = 16;
 /// Agreement of a turned view's fine detail with the middle view's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Detail {
-    /// How far the view is turned, radians; the mean of both sides is reported.
+    /// How far the view is turned, radians; what follows is the mean of both sides.
     pub turn_rad: f64,
     /// Correlation of the high-passed luma of the finished pictures after the warp.
     pub correlation: Option<f64>,
@@ -105,7 +105,7 @@ impl Detail {
     fn mean(details: &[Self]) -> Self {
         let of = |value: fn(&Self) -> Option<f64>| mean(details.iter().filter_map(value));
         Self {
-            turn_rad: of(|detail| Some(detail.turn_rad)).unwrap_or_default(),
+            turn_rad: details.first().map_or(0.0, |detail| detail.turn_rad),
             correlation: of(|detail| detail.correlation),
             unwarped_correlation: of(|detail| detail.unwarped_correlation),
             field_correlation: of(|detail| detail.field_correlation),

@@ -28,6 +28,8 @@ const PALETTE: [RGBColor; 7] = [
     RGBColor(86, 180, 233),
     RGBColor(90, 90, 90),
 ];
+/// Share of a chart's height that is kept free for its legend.
+const LEGEND_ROOM: f64 = 0.18;
 /// Axes aim at this many ticks.
 const TICKS: f64 = 6.0;
 
@@ -99,6 +101,14 @@ struct Ruler {
     low: f64,
     high: f64,
     ticks: Vec<f64>,
+}
+
+impl Ruler {
+    /// Room for a legend above everything drawn, if there is one.
+    fn below_legend(self, wanted: bool) -> Self {
+        let room = if wanted { LEGEND_ROOM * (self.high - self.low) } else { 0.0 };
+        Self { high: self.high + room, ..self }
+    }
 }
 
 impl Ranged for Ruler {
@@ -180,7 +190,8 @@ impl LineChart {
             })
             .collect();
         let x = self.x.ruler(lines.iter().flatten().map(|point| point.0));
-        let y = self.y.ruler(lines.iter().flatten().map(|point| point.1));
+        let named = self.series.iter().any(|series| !series.name.is_empty());
+        let y = self.y.ruler(lines.iter().flatten().map(|point| point.1)).below_legend(named);
         draw(|area| {
             let mut chart = frame(area, &self.title, (&x, &y))?;
             mesh(&mut chart, (&self.x.title, &|place| self.x.label(*place)), (&self.y, &|place| self.y.label(*place)))?;
@@ -198,7 +209,7 @@ impl LineChart {
                     chart.draw_series(dots).map_err(fault)?;
                 }
             }
-            legend(&mut chart, self.series.iter().any(|series| !series.name.is_empty()))
+            legend(&mut chart, named)
         })
     }
 
@@ -242,7 +253,8 @@ impl BarChart {
     pub fn svg(&self) -> Result<String> {
         let y = Axis { from_zero: true, ..self.y.clone() };
         let values = self.series.iter().flat_map(|(_, values)| values).flatten();
-        let mut up = y.ruler(values.filter_map(|value| y.place(*value)));
+        let named = self.series.iter().any(|(label, _)| !label.is_empty());
+        let mut up = y.ruler(values.filter_map(|value| y.place(*value))).below_legend(named);
         if y.logarithmic {
             // The smallest bar must be seen too.
             up.low -= 0.1 * (up.high - up.low);
@@ -269,7 +281,7 @@ impl BarChart {
                         .legend(move |(x, y)| Rectangle::new([(x, y - 5), (x + 14, y + 5)], colour.filled()));
                 }
             }
-            legend(&mut chart, self.series.iter().any(|(label, _)| !label.is_empty()))
+            legend(&mut chart, named)
         })
     }
 
