@@ -133,7 +133,7 @@ impl Portraits {
         match (&self.generator, self.files.get(index)) {
             (Some(generator), _) => {
                 let camera = match &self.dataset {
-                    Some(dataset) => camera_like(Some(dataset), self.seed, index)?,
+                    Some(dataset) => camera_like(dataset, self.seed, index)?,
                     None => cnerf_core::camera::Camera::default(),
                 };
                 let subject = Subject::random(generator, seed, self.truncation, camera)?;

@@ -15,7 +15,6 @@ use super::{
 };
 use crate::{
     camera::Camera,
-    codes,
     data::{
         dataset::{Dataset, Item},
         labels::LabelMap,
@@ -25,6 +24,7 @@ use crate::{
     model::generator::Generator,
     region::{REGION_COUNT, Region},
     rng::Stream,
+    train::portrait_codes::PortraitCodes,
 };
 
 /// Width and height that the blur reference is reduced to, pixels.
@@ -306,29 +306,33 @@ pub struct Reconstruction {
     pub lpips: Option<f64>,
 }
 
-/// Shows training portraits from their own codes, z `[M, D]` as a run's `codes.safetensors` holds them (photos in the
-/// data set's order, then mirrored copies), and compares them with the photos.
+/// Whether there is a code for every photo of `dataset`, or for it and its mirrored copy.
+pub fn are_codes_of(portraits: &PortraitCodes, dataset: &Dataset) -> bool {
+    [dataset.len(), 2 * dataset.len()].contains(&portraits.count())
+}
+
+/// Shows training portraits from their own codes (photos in the data set's order, then mirrored copies), and compares
+/// them with the photos.
 ///
 /// # Errors
 /// [`Error::Shape`] if the codes are not those of `dataset`.
 pub fn reconstruction(
     generator: &Generator,
-    z: &Tensor,
+    portraits: &PortraitCodes,
     dataset: &Dataset,
     features: Option<&PooledFeatures>,
     options: &RealismOptions,
 ) -> Result<Reconstruction> {
-    let rows = z.dim(0)?;
-    if rows != dataset.len() && rows != 2 * dataset.len() {
-        let expected = format!("[{} or {}, D] of the data set's photos", dataset.len(), 2 * dataset.len());
-        return Err(Error::shape("training codes", expected, z.dims()));
+    if !are_codes_of(portraits, dataset) {
+        let expected = format!("codes of {} portraits and their mirrored copies", dataset.len());
+        return Err(Error::shape("training codes", expected, portraits.noise.dims()));
     }
     let (device, resolution) = (generator.device(), generator.output_resolution());
     let (mut found, mut agreement, mut distance) = (Reconstruction::default(), Agreement::default(), 0.0);
     let mut masked = false;
     for index in chosen(dataset, options) {
         let Item { image, mask, camera } = dataset.item(index)?;
-        let codes = codes::broadcast(&generator.map(&z.narrow(0, index, 1)?)?)?.detach();
+        let codes = portraits.codes(generator, &[index as u32])?.detach();
         let shown = picture_of(generator, &codes, None, &camera.unwrap_or_default())?;
         let psnr = |rgb: &Tensor, side: usize| -> Result<f64> {
             Ok(quality::psnr(rgb, &at(&image, side, &device)?)?.first().copied().unwrap_or_default())
@@ -356,11 +360,14 @@ pub fn reconstruction(
     })
 }
 
-/// The camera of a photo of `dataset`, or one as photos have it: what `eval` looks at portrait `index` from.
-pub fn camera_like(dataset: Option<&Dataset>, seed: u64, index: usize) -> Result<Camera> {
-    let drawn = photo_camera(seed, index as u64);
-    let Some(dataset) = dataset else { return Ok(drawn) };
+/// The camera of one of `dataset`'s photos, or of photos in general where it names none: what portrait `index` of an
+/// evaluation is seen from.
+///
+/// # Errors
+/// A camera in the data set whose angles are out of range.
+pub fn camera_like(dataset: &Dataset, seed: u64, index: usize) -> Result<Camera> {
     let order = Stream::new(seed, &[STREAM]).permutation(dataset.len());
     let item = order.get(index % order.len().max(1)).copied();
-    Ok(item.map(|item| dataset.camera(item)).transpose()?.flatten().unwrap_or(drawn))
+    let camera = item.map(|item| dataset.camera(item)).transpose()?.flatten();
+    Ok(camera.unwrap_or_else(|| photo_camera(seed, index as u64)))
 }

@@ -120,7 +120,7 @@ impl QualityArguments {
         let path = Path::new(model_name(&self.model));
         if has_codes(path)
             && let Some(codes) = Start::open(path, &generator.device())?.portrait_codes
-            && [dataset.len(), 2 * dataset.len()].contains(&codes.dim(0)?)
+            && realism::are_codes_of(&codes, dataset)
         {
             let options = RealismOptions { count, truncation: self.trunc, seed };
             let found = realism::reconstruction(generator, &codes, dataset, features, &options)?;
