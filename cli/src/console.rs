@@ -25,6 +25,33 @@ impl From<Outcome> for ExitCode {
     }
 }
 
+/// Shows what the argument parser has to say: help and version as they are, a mistake in one line.
+pub fn explain(error: &clap::Error) -> ExitCode {
+    let whole_help = error.kind() == clap::error::ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand;
+    if whole_help || !error.use_stderr() {
+        // A closed pipe (`cnerf help | head -1`) is the reader's choice.
+        let _ = error.print();
+        return if whole_help { ExitCode::from(2) } else { ExitCode::SUCCESS };
+    }
+    eprintln!("{}", one_line(&error.to_string()));
+    ExitCode::from(2)
+}
+
+/// The argument parser's message without its usage, its lines joined.
+fn one_line(message: &str) -> String {
+    let said = message
+        .lines()
+        .map(str::trim)
+        .take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more information"))
+        .filter(|line| !line.is_empty());
+    let mut joined = String::new();
+    for line in said {
+        joined.push_str(if joined.is_empty() { "" } else if joined.ends_with(':') { " " } else { "; " });
+        joined.push_str(line);
+    }
+    format!("{joined}; try --help")
+}
+
 /// The terminal, as quiet or talkative as asked.
 pub struct Console {
     quiet: bool,
@@ -81,6 +108,11 @@ impl Console {
         }
     }
 
+    /// Whether only errors and the result are wanted.
+    pub fn is_quiet(&self) -> bool {
+        self.quiet
+    }
+
     /// A warning, on stderr even when quiet.
     pub fn warn(&self, line: impl std::fmt::Display) {
         eprintln!("warning: {line}");
@@ -102,5 +134,20 @@ impl Console {
         // A closed pipe (`cnerf info x | head -1`) is the reader's choice, not a fault.
         let _ = writeln!(std::io::stdout(), "{text}");
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::one_line;
+
+    #[test]
+    fn a_mistake_is_told_in_one_line() {
+        let message = "error: unexpected argument '--sedes' found\n\n  tip: a similar argument exists: '--seeds'\n\n\
+                       Usage: cnerf generate --out <DIR>\n\nFor more information, try '--help'.\n";
+        let expected = "error: unexpected argument '--sedes' found; tip: a similar argument exists: '--seeds'; try --help";
+        assert_eq!(one_line(message), expected);
+        let missing = "error: the following required arguments were not provided:\n  --out <DIR>\n\nUsage: cnerf\n";
+        assert_eq!(one_line(missing), "error: the following required arguments were not provided: --out <DIR>; try --help");
     }
 }

@@ -17,7 +17,10 @@ use clap::Parser as _;
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    let arguments = commands::Arguments::parse();
+    let arguments = match commands::Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => return console::explain(&error),
+    };
     if let Some(threads) = arguments.global.threads {
         // SAFETY: no other thread runs yet. candle's matrix products read their thread count here and nowhere else.
         unsafe { std::env::set_var("RAYON_NUM_THREADS", threads.to_string()) };

@@ -6,6 +6,7 @@ use clap::ValueEnum;
 use cnerf_core::{
     camera::Camera,
     data::{labels::LabelMap, picture},
+    interop::page::PageFrame,
     model::generator::{Generator, Picture},
     region::RegionSet,
 };
@@ -36,6 +37,39 @@ impl View {
     }
 }
 
+/// How a pair of views for two eyes is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Stereo {
+    /// The left eye's view left, the right eye's right
+    Side,
+    /// Grey for the left eye in red, colours for the right eye in cyan (red-cyan glasses)
+    Anaglyph,
+}
+
+/// Half the angle under which a head sees the distance between two eyes, radians: 63 mm at arm's length.
+const HALF_EYE_DISTANCE_RAD: f64 = 0.045;
+
+impl Stereo {
+    /// The left and the right eye's cameras around `camera`. From the left, one sees more of the head's right: the
+    /// camera moves to smaller azimuths.
+    pub fn cameras(camera: &Camera) -> [Camera; 2] {
+        [-1.0, 1.0].map(|side| Camera { azimuth_rad: camera.azimuth_rad + side * HALF_EYE_DISTANCE_RAD, ..*camera })
+    }
+
+    /// Both eyes' pictures as one.
+    pub fn join(self, left: &RgbImage, right: &RgbImage) -> RgbImage {
+        match self {
+            Self::Side => side_by_side(&[left.clone(), right.clone()]),
+            // A grey left eye avoids the flicker between eyes that red skin or a blue flag would give.
+            Self::Anaglyph => RgbImage::from_fn(left.width().min(right.width()), left.height().min(right.height()), |x, y| {
+                let ([red, green, blue], [_, right_green, right_blue]) = (left.get_pixel(x, y).0, right.get_pixel(x, y).0);
+                let grey = 0.299 * f64::from(red) + 0.587 * f64::from(green) + 0.114 * f64::from(blue);
+                image::Rgb([grey.round() as u8, right_green, right_blue])
+            }),
+        }
+    }
+}
+
 /// Depths shown white and black, world units along the view axis.
 const DEPTH_SHOWN: [f64; 2] = [0.92, 1.08];
 
@@ -54,14 +88,29 @@ pub struct Scene<'a> {
 impl Scene<'_> {
     /// One picture for each of `views`, at the model's output resolution.
     pub fn pictures(&self, camera: &Camera, views: &[View]) -> anyhow::Result<Vec<RgbImage>> {
+        let picture = self.picture(camera, views.contains(&View::Normal))?;
+        views.iter().map(|view| self.show(&picture, *view)).collect()
+    }
+
+    /// All that a page shows of one view.
+    pub fn page_frame(&self, camera: &Camera) -> anyhow::Result<PageFrame> {
+        let picture = self.picture(camera, true)?;
+        Ok(PageFrame {
+            portrait: self.show(&picture, View::Rgb)?,
+            depth: self.show(&picture, View::Depth)?,
+            normal: self.show(&picture, View::Normal)?,
+            labels: LabelMap::from_masks(&picture.masks.squeeze(0)?)?,
+        })
+    }
+
+    fn picture(&self, camera: &Camera, normals: bool) -> anyhow::Result<Picture> {
         let mut settings = self.generator.render_settings();
         settings.regions = self.regions;
-        settings.normals |= views.contains(&View::Normal);
+        settings.normals |= normals;
         let cameras = Camera::parameter_tensor(&[*camera], &self.generator.device())?;
         let frame = self.generator.render(self.codes, &cameras, &settings)?;
         let lifted = self.generator.upsample(&frame, self.codes, self.global)?;
-        let picture = Picture { rgb: lifted.rgb, masks: lifted.masks, frame };
-        views.iter().map(|view| self.show(&picture, *view)).collect()
+        Ok(Picture { rgb: lifted.rgb, masks: lifted.masks, frame })
     }
 
     fn show(&self, picture: &Picture, view: View) -> anyhow::Result<RgbImage> {
@@ -98,4 +147,21 @@ pub fn side_by_side(pictures: &[RgbImage]) -> RgbImage {
         x += i64::from(picture.width());
     }
     strip
+}
+
+#[cfg(test)]
+mod tests {
+    use image::Rgb;
+
+    use super::*;
+
+    #[test]
+    fn each_eye_gets_its_picture() {
+        let [left, right] = Stereo::cameras(&Camera::at(0.2, 0.1));
+        assert!(left.azimuth_rad < 0.2 && right.azimuth_rad > 0.2 && left.elevation_rad == 0.1);
+        let [left, right] = [[200, 100, 0], [1, 2, 3]].map(|colour| RgbImage::from_pixel(4, 4, Rgb(colour)));
+        assert_eq!(Stereo::Anaglyph.join(&left, &right).get_pixel(1, 1).0, [119, 2, 3]);
+        let side = Stereo::Side.join(&left, &right);
+        assert_eq!((side.dimensions(), side.get_pixel(3, 0).0, side.get_pixel(4, 0).0), ((8, 4), [200, 100, 0], [1, 2, 3]));
+    }
 }

@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 #[non_exhaustive]
 pub enum Error {
     /// A file could not be opened, read, written or renamed.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {}", path.display(), in_plain_words(error))]
     Io {
         /// The file or folder at fault.
         path: PathBuf,
-        /// The operating system's word.
-        source: std::io::Error,
+        /// The operating system's word. Not this error's source: the message says it already.
+        error: std::io::Error,
     },
     /// A file was read but is not what it should be. `reason` says what is wrong and what to do.
     #[error("{}: {reason}", path.display())]
@@ -54,6 +54,24 @@ pub enum Error {
     Tensor(#[from] candle_core::Error),
 }
 
+/// What happened to a file and what to do, without the operating system's numbers.
+fn in_plain_words(error: &std::io::Error) -> String {
+    use std::io::ErrorKind;
+    if let Some(own) = error.get_ref() {
+        return own.to_string();
+    }
+    match error.kind() {
+        ErrorKind::NotFound => "no such file or folder; check its name".into(),
+        ErrorKind::PermissionDenied => "may not be read or written; change its permissions or choose another".into(),
+        ErrorKind::IsADirectory => "is a folder; name a file".into(),
+        ErrorKind::NotADirectory => "a part of this path is a file and not a folder; check its name".into(),
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "the disk is full; make room or choose another".into(),
+        ErrorKind::ReadOnlyFilesystem => "lies on a disk that is read-only; choose another place".into(),
+        ErrorKind::InvalidFilename => "no name a file can have; choose another".into(),
+        _ => error.to_string(),
+    }
+}
+
 /// The core library's result.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
@@ -70,8 +88,8 @@ impl From<cnerf_kernels::Error> for Error {
 
 impl Error {
     /// An [`Error::Io`] at `path`; made to be used as `.map_err(|e| Error::io(path, e))`.
-    pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
-        Self::Io { path: path.as_ref().to_owned(), source }
+    pub fn io(path: impl AsRef<Path>, error: std::io::Error) -> Self {
+        Self::Io { path: path.as_ref().to_owned(), error }
     }
 
     /// An [`Error::Malformed`] at `path`.
@@ -92,5 +110,17 @@ impl Error {
     /// An [`Error::NotFinite`] without further context.
     pub fn not_finite(quantity: impl Into<String>) -> Self {
         Self::NotFinite { quantity: quantity.into(), context: None }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_missing_file_is_told_once_with_the_remedy() {
+        let error = std::fs::read("nowhere/at_all.bin").map_err(|error| Error::io("nowhere/at_all.bin", error)).unwrap_err();
+        assert_eq!(error.to_string(), "nowhere/at_all.bin: no such file or folder; check its name");
+        assert!(std::error::Error::source(&error).is_none(), "a chain would say it twice");
     }
 }

@@ -1,4 +1,4 @@
-//! Other programs' files: the authors' checkpoints, meshes, animations.
+//! Other programs' files: the authors' checkpoints, meshes, animations, pages.
 
 pub mod animation;
 pub mod authors;
@@ -6,6 +6,7 @@ pub mod authors_checkpoint;
 pub mod authors_nets;
 pub mod chart;
 pub mod mesh;
+pub mod page;
 pub mod sheet;
 pub mod surface;
 pub mod torch;

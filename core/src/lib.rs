@@ -2,7 +2,7 @@
 //! over one signed distance field, rendered and lifted to pictures; how to train it, and how to measure it.
 //!
 //! A floor uses only floors below it:
-//! vocabulary ([`region`], [`camera`], [`codes`], [`config`], [`parameters`], [`rng`], [`error`]) →
+//! vocabulary ([`region`], [`camera`], [`codes`], [`config`], [`parameters`], [`rng`], [`files`], [`error`]) →
 //! [`kernels`] → [`render`] → [`model`] → [`data`] / [`train`] → [`eval`] / [`interop`].
 
 pub mod camera;
@@ -11,6 +11,7 @@ pub mod config;
 pub mod data;
 pub mod error;
 pub mod eval;
+pub mod files;
 pub mod interop;
 pub mod model;
 pub mod parameters;

@@ -40,7 +40,7 @@ pub struct Face {
 
 /// The faces of a photo, largest first. An empty list is no error.
 pub fn faces(photo: &RgbImage) -> Result<Vec<Face>> {
-    let grey = photo::luma(photo);
+    let grey = photo::luma(photo)?;
     let longest = grey.width().max(grey.height());
     let mut lifted = grey.clone();
     // The square root of brightness in [0, 1].
@@ -60,16 +60,29 @@ pub fn faces(photo: &RgbImage) -> Result<Vec<Face>> {
     Ok(Vec::new())
 }
 
-/// The face numbered `index` (0 is the largest) of the photo read from `path`, and how many there are.
+/// Faces in words, numbered as [`choose`] numbers them: where each is and how wide.
+pub fn list(faces: &[Face]) -> String {
+    const MOST: usize = 12;
+    let one = |(number, face): (usize, &Face)| {
+        format!("{number}: {:.0} pixels wide at {:.0},{:.0}", face.width, face.centre_x, face.centre_y)
+    };
+    let mut words: Vec<String> = faces.iter().enumerate().take(MOST).map(one).collect();
+    if faces.len() > MOST {
+        words.push(format!("and {} more", faces.len() - MOST));
+    }
+    words.join("; ")
+}
+
+/// The face numbered `index` (0 is the largest) of the photo read from `path`, and all there are.
 ///
 /// Errors: [`Error::NoFace`], [`Error::NoSuchFace`], [`Error::FaceTooSmall`], [`Error::TooDark`].
-pub fn choose(path: &Path, photo: &RgbImage, index: usize) -> Result<(Face, usize)> {
+pub fn choose(path: &Path, photo: &RgbImage, index: usize) -> Result<(Face, Vec<Face>)> {
     let found = faces(photo)?;
     if found.is_empty() {
         return Err(Error::NoFace { path: path.to_owned() });
     }
     let Some(face) = found.get(index).copied() else {
-        return Err(Error::NoSuchFace { path: path.to_owned(), wanted: index, found: found.len() });
+        return Err(Error::NoSuchFace { path: path.to_owned(), wanted: index, found: found.len(), list: list(&found) });
     };
     if face.width < f64::from(SMALLEST_FACE) {
         return Err(Error::FaceTooSmall {
@@ -82,7 +95,7 @@ pub fn choose(path: &Path, photo: &RgbImage, index: usize) -> Result<(Face, usiz
     if brightness < LEAST_BRIGHTNESS {
         return Err(Error::TooDark { path: path.to_owned(), brightness, least: LEAST_BRIGHTNESS });
     }
-    Ok((face, found.len()))
+    Ok((face, found))
 }
 
 fn faces_at(grey: &GrayImage, scale: f64) -> Result<Vec<Face>> {
@@ -143,8 +156,8 @@ mod tests {
 
     #[test]
     fn the_astronaut_has_one_face_where_it_is() {
-        let (face, count) = choose(Path::new("astronaut.png"), &astronaut(), 0).unwrap();
-        assert_eq!(count, 1);
+        let (face, found) = choose(Path::new("astronaut.png"), &astronaut(), 0).unwrap();
+        assert_eq!(found.len(), 1);
         // Eyes at (204, 101) and (248, 103), mouth at (224, 145).
         assert!((face.centre_x - 224.0).abs() < 8.0 && (face.centre_y - 117.0).abs() < 8.0, "{face:?}");
         assert!((80.0..120.0).contains(&face.width), "{face:?}");
@@ -173,5 +186,8 @@ mod tests {
         let found = faces(&pair).unwrap();
         assert_eq!(found.len(), 2, "{found:?}");
         assert!(found[0].width > found[1].width && found[0].centre_x > 500.0);
+        assert!(list(&found).contains("; 1: "), "{}", list(&found));
+        let error = choose(Path::new("pair.png"), &pair, 2).unwrap_err().to_string();
+        assert!(error.contains("face 2") && error.contains("1: "), "{error}");
     }
 }

@@ -1,9 +1,16 @@
-//! Edits: rows of a portrait's codes moved to another portrait's, a seed's or the mean's, and what that changed.
+//! Edits: rows of a portrait's codes moved to another portrait's, a seed's, the mean's, along a direction, or to where
+//! a painted map or a colour asks for; and what that changed.
+
+mod colour;
+mod directions;
+mod displacement;
+mod paint;
 
 use std::path::Path;
 
 use candle_core::Tensor;
 use cnerf_core::{
+    camera::Camera,
     codes::{self, Aspect},
     data::{labels::LabelMap, picture},
     eval::quality,
@@ -13,6 +20,11 @@ use cnerf_core::{
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
+pub use self::{
+    colour::{Colour, mean_colour, perceived_difference},
+    directions::{directions, preview},
+    paint::read_map,
+};
 use crate::{
     error::{Error, Result},
     inverter::{Opened, one_picture},
@@ -30,6 +42,25 @@ pub enum Source {
     Seed(u64),
     /// The model's mean portrait.
     Mean,
+    /// A repainted region map, by the name it was given.
+    Painted(String),
+    /// A colour.
+    Colour(Colour),
+    /// A principal direction of the regions' codes, counted from 1; an amount of 1 is a standard deviation.
+    Direction(usize),
+}
+
+/// A [`Source`] that is at hand.
+#[derive(Clone, Debug)]
+pub enum Goal {
+    /// Codes `[1, 9, 2, D]`.
+    Codes(Tensor),
+    /// A region map of the portrait's own view, repainted.
+    Painted(LabelMap),
+    /// The regions' mean colour is to be this.
+    Colour(Colour),
+    /// See [`Source::Direction`].
+    Direction(usize),
 }
 
 /// What to change.
@@ -69,22 +100,64 @@ pub struct Edited {
     pub after: RgbImage,
     /// Regions after.
     pub regions: RgbImage,
+    /// How far the last [`Goal::Colour`]'s region ended from its colour, see [`perceived_difference`].
+    pub colour_difference: Option<f64>,
 }
 
-/// The codes `[1, 9, 2, D]` an edit goes towards. `other` is the portrait a [`Source::Portrait`] names; it must belong
-/// to the same model, which [`crate::inverter::Opened`] checks.
-pub fn source_codes(model: &Generator, source: &Source, other: Option<&Portrait>) -> Result<Tensor> {
-    Ok(match (source, other) {
-        (Source::Seed(seed), _) => model.codes_from_seed(*seed, 1.0)?,
-        (Source::Mean, _) => model.mean_codes()?,
-        (Source::Portrait(_), Some(portrait)) => portrait.codes.unsqueeze(0)?.to_device(&model.device())?,
-        (Source::Portrait(name), None) => return Err(Error::config("--from", format!("{name} was not read"))),
-    })
+impl Goal {
+    /// What `source` means for `model`. `other` is the portrait a [`Source::Portrait`] names, which must belong to the
+    /// same model; `map` is the map a [`Source::Painted`] names.
+    pub fn of(source: &Source, model: &Generator, other: Option<&Portrait>, map: Option<LabelMap>) -> Result<Self> {
+        let unread = |name: &str| Error::config("edit", format!("{name} was not read"));
+        Ok(match source {
+            Source::Seed(seed) => Self::Codes(model.codes_from_seed(*seed, 1.0)?),
+            Source::Mean => Self::Codes(model.mean_codes()?),
+            Source::Portrait(name) => {
+                let portrait = other.ok_or_else(|| unread(name))?;
+                Self::Codes(portrait.codes.unsqueeze(0)?.to_device(&model.device())?)
+            }
+            Source::Painted(name) => Self::Painted(map.ok_or_else(|| unread(name))?),
+            Source::Colour(colour) => Self::Colour(*colour),
+            Source::Direction(number) => Self::Direction(*number),
+        })
+    }
+
+    /// The codes `[1, 9, 2, D]` an edit of `opened` goes towards, and the regions it is about: those named, or those a
+    /// map changes where none is named.
+    fn resolve(&self, opened: &Opened, camera: &Camera, edit: &Edit) -> Result<(Tensor, RegionSet)> {
+        let regions = edit.regions;
+        Ok(match self {
+            Self::Codes(codes) => (codes.clone(), regions),
+            Self::Direction(number) => {
+                let rows = directions(&opened.generator, regions, edit.aspect, *number)?;
+                let style_dim = rows.dim(1)?;
+                let direction = rows.narrow(0, number.saturating_sub(1), 1)?.reshape((1, 1, 1, style_dim))?;
+                (opened.codes.broadcast_add(&direction)?, regions)
+            }
+            Self::Painted(map) => {
+                let shown = opened.picture(camera)?.masks;
+                let shown = LabelMap::from_masks(&shown.squeeze(0)?)?;
+                let map = map.resized(shown.width(), shown.height())?;
+                let regions = if regions.is_empty() { paint::repainted(&shown, &map) } else { regions };
+                if regions.is_empty() {
+                    return Err(Error::config("--mask-paint", "the map changes no region; repaint some of it"));
+                }
+                (paint::codes(opened, camera, &map, regions)?, regions)
+            }
+            Self::Colour(colour) => {
+                let mut found = opened.clone();
+                for region in regions.iter() {
+                    found.codes = colour::codes(&found, camera, region, *colour)?;
+                }
+                (found.codes, regions)
+            }
+        })
+    }
 }
 
-/// Applies edits in order, each with the codes it goes towards, and measures what they changed together. The
-/// portrait, read from `path`, gets one entry of history an edit. On an error it stays as it was.
-pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(Edit, Tensor)]) -> Result<Edited> {
+/// Applies edits in order, each with what it goes towards, and measures what they changed together. The portrait, read
+/// from `path`, gets one entry of history an edit. On an error it stays as it was.
+pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(Edit, Goal)]) -> Result<Edited> {
     for (edit, _) in edits {
         edit.validate()?;
     }
@@ -94,34 +167,85 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
     let mut before = first.clone();
     let mut history = Vec::with_capacity(edits.len());
     let mut all = RegionSet::EMPTY;
-    for (edit, source) in edits {
+    let mut colour_difference = None;
+    for (edit, goal) in edits {
+        let (source, regions) = goal.resolve(&opened, &camera, edit)?;
+        let edit = Edit { regions, ..edit.clone() };
         let undo = Undo { codes: opened.codes.squeeze(0)?, upsampler_code: portrait.upsampler_code.clone() };
-        opened.codes = codes::blend(&opened.codes, source, edit.regions, edit.aspect, edit.amount)?.detach();
+        opened.codes = codes::blend(&opened.codes, &source, edit.regions, edit.aspect, edit.amount)?.detach();
         let after = opened.picture(&camera)?;
         let change = measure(&before, &after, edit.regions)?;
-        history.push((EditRecord { edit: edit.clone(), change }, undo));
-        all = all.union(edit.regions);
+        if let Goal::Colour(colour) = goal {
+            colour_difference = farthest_from(*colour, &opened, &camera, regions)?;
+        }
+        history.push((EditRecord { edit, change }, undo));
+        all = all.union(regions);
         before = after;
     }
-    let change = measure(&first, &before, all)?;
-    let [before_picture, after_picture] = [&first.rgb, &before.rgb].map(one_picture);
-    let edited = Edited {
-        change,
-        before: before_picture?,
-        after: after_picture?,
-        regions: LabelMap::from_masks(&before.masks.squeeze(0)?)?.colours(),
-    };
-    portrait.thumbnail =
-        picture::resize(&edited.after, portrait.thumbnail.width().max(1), portrait.thumbnail.height().max(1))?;
+    let edited = Edited { colour_difference, ..compare(&first, &before, all)? };
+    portrait.thumbnail = thumbnail(portrait, &edited.after)?;
     portrait.codes = opened.codes.squeeze(0)?;
     portrait.history.extend(history);
     Ok(edited)
 }
 
+/// The region map of the portrait, read from `path`, in its own view: what a user repaints.
+pub fn own_map(portrait: &Portrait, path: &Path, model: &Generator) -> Result<LabelMap> {
+    let picture = Opened::new(portrait, path, model)?.picture(&portrait.camera)?;
+    Ok(LabelMap::from_masks(&picture.masks.squeeze(0)?)?)
+}
+
+/// Takes back the last edit of the portrait read from `path`, thumbnail included, and says what that changed.
+///
+/// # Errors
+/// [`Error::NothingToUndo`], and those of opening the portrait.
+pub fn undo(portrait: &mut Portrait, path: &Path, model: &Generator) -> Result<(EditRecord, Edited)> {
+    let camera = portrait.camera;
+    let before = Opened::new(portrait, path, model)?.picture(&camera)?;
+    let mut restored = portrait.clone();
+    let record = restored.undo(path)?;
+    let after = Opened::new(&restored, path, model)?.picture(&camera)?;
+    let edited = compare(&before, &after, record.edit.regions)?;
+    restored.thumbnail = thumbnail(&restored, &edited.after)?;
+    *portrait = restored;
+    Ok((record, edited))
+}
+
+/// What became of the first picture in the second, in which `regions` were edited.
+fn compare(before: &Picture, after: &Picture, regions: RegionSet) -> Result<Edited> {
+    Ok(Edited {
+        change: measure(before, after, regions)?,
+        before: one_picture(&before.rgb)?,
+        after: one_picture(&after.rgb)?,
+        regions: LabelMap::from_masks(&after.masks.squeeze(0)?)?.colours(),
+        colour_difference: None,
+    })
+}
+
+/// A picture at the size of the portrait's thumbnail.
+fn thumbnail(portrait: &Portrait, picture: &RgbImage) -> Result<RgbImage> {
+    let (width, height) = portrait.thumbnail.dimensions();
+    Ok(picture::resize(picture, width.max(1), height.max(1))?)
+}
+
+/// The largest perceived difference of the regions' mean colours from `colour`; none if none of them shows.
+fn farthest_from(colour: Colour, opened: &Opened, camera: &Camera, regions: RegionSet) -> Result<Option<f64>> {
+    let wanted = colour.0.map(|value| f64::from(value) / 127.5 - 1.0);
+    let mut farthest: Option<f64> = None;
+    for region in regions.iter() {
+        if let Some(mean) = mean_colour(opened, camera, region)? {
+            let difference = perceived_difference(mean, wanted)?;
+            farthest = Some(farthest.map_or(difference, |farthest| farthest.max(difference)));
+        }
+    }
+    Ok(farthest)
+}
+
 impl Edit {
     fn validate(&self) -> Result<()> {
         const FARTHEST: f64 = 10.0;
-        if self.regions.is_empty() {
+        // A painted map says which regions it changes.
+        if self.regions.is_empty() && !matches!(self.source, Source::Painted(_)) {
             return Err(Error::config("--region", "names no region"));
         }
         if self.amount.is_nan() || self.amount.abs() > FARTHEST {

@@ -28,7 +28,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// There are faces, but not the one asked for.
-    #[error("{}: face {wanted} asked for, but only {found} found (the largest is face 0)", path.display())]
+    #[error("{}: face {wanted} asked for, but only {found} found ({list})", path.display())]
     NoSuchFace {
         /// The photo.
         path: PathBuf,
@@ -36,6 +36,8 @@ pub enum Error {
         wanted: usize,
         /// How many there are.
         found: usize,
+        /// What [`crate::detect::list`] says of them.
+        list: String,
     },
     /// The chosen face covers too few pixels to show anything.
     #[error("{}: the face is {pixels} pixels wide; at least {least} are needed: crop from a larger original", path.display())]

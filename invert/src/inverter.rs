@@ -210,6 +210,7 @@ impl<'a> Inverter<'a> {
 }
 
 /// The tuned generator of a portrait, and its codes and camera as tensors: all that rendering it needs.
+#[derive(Clone)]
 pub struct Opened {
     /// The model with the portrait's weights.
     pub generator: Generator,
@@ -237,6 +238,31 @@ impl Opened {
         let view = Camera::parameter_tensor(&[*camera], &self.generator.device())?;
         whole_picture(&self.generator, &self.codes, self.global.as_ref(), &view, false)
     }
+}
+
+/// About how many seconds a photo will take with this configuration, on this machine: one step of each kind, timed on
+/// a grey picture.
+pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, perceptual: Option<&Perceptual>) -> Result<f64> {
+    /// A step of tuning against a step of the pivot on whole pictures: depth and locality come on top.
+    const TUNE_SHARE: f64 = 1.3;
+    let began = Instant::now();
+    let side = generator.output_resolution() as u32;
+    let grey = RgbImage::from_pixel(side, side, image::Rgb([128; 3]));
+    let target = Target::new(&grey, None, generator, perceptual)?;
+    let steps = config.steps();
+    // A pivot of a single step takes it on rays, with as many rays as the effort has.
+    let single = InvertConfig { pivot_steps: Some(1), ..config.clone() };
+    let mut pivot = Pivot::new(generator, &Camera::default(), &single)?;
+    let started = Instant::now();
+    pivot.step(generator, &target)?;
+    let on_rays = started.elapsed().as_secs_f64();
+    let started = Instant::now();
+    pivot.whole_loss(generator, &target)?.total.backward()?;
+    let whole = started.elapsed().as_secs_f64();
+    let steps_on_rays = (steps.shared + steps.free) as f64;
+    // What was done here is done again: the space of codes, the target's features.
+    let rest = began.elapsed().as_secs_f64() - on_rays - whole;
+    Ok(rest + on_rays * steps_on_rays + whole * (steps.whole as f64 + TUNE_SHARE * steps.tune as f64))
 }
 
 fn psnr(found: &Tensor, photo: &Tensor) -> Result<f64> {

@@ -1,6 +1,9 @@
 //! A photo brought into the models' frame: read, its face found and aligned, its region masks if somebody knows them.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use cnerf_core::{
     camera::Camera,
@@ -9,7 +12,9 @@ use cnerf_core::{
         picture,
     },
 };
-use image::{GrayImage, Luma, RgbImage};
+use image::{GrayImage, RgbImage};
+use kornia_image::{Image, ImageError, ImageSize};
+use kornia_imgproc::color::gray_from_rgb_u8;
 
 use crate::{
     align::{self, Aligned, CropTransform},
@@ -45,8 +50,10 @@ pub struct Subject {
     pub source: String,
     /// The crop, its place in the photo and the first camera.
     pub aligned: Aligned,
-    /// Region of every pixel of the crop, if known.
+    /// Region of every pixel of the crop, if known, at a size of its own.
     pub labels: Option<LabelMap>,
+    /// How long the parser took, seconds, if it was asked.
+    pub parser_seconds: Option<f64>,
     /// What the user should know, e.g. that there were several faces.
     pub warnings: Vec<String>,
 }
@@ -65,11 +72,11 @@ impl Subject {
             }
             align::already_aligned(&photo, size)?
         } else {
-            let (face, count) = detect::choose(path, &photo, options.face)?;
-            if count > 1 {
-                let taken =
-                    if options.face == 0 { "the largest".to_owned() } else { format!("number {}", options.face) };
-                warnings.push(format!("{}: {count} faces found, {taken} is taken", path.display()));
+            let (face, found) = detect::choose(path, &photo, options.face)?;
+            if found.len() > 1 {
+                let (count, taken) = (found.len(), options.face);
+                let list = detect::list(&found);
+                warnings.push(format!("{}: {count} faces, number {taken} is taken ({list})", path.display()));
             }
             align::align(&photo, &face, size)?
         };
@@ -80,12 +87,18 @@ impl Subject {
         if let Some([azimuth, elevation]) = options.pose {
             aligned.camera = Camera { roll_rad: aligned.camera.roll_rad, ..Camera::at(azimuth, elevation) };
         }
+        let mut parser_seconds = None;
         let labels = match (&options.mask, parser) {
             (Some(mask), _) => Some(read_labels(mask, &photo, &aligned.transform, size)?),
-            (None, Some(parser)) => Some(parser.parse(&aligned.picture)?),
+            (None, Some(parser)) => {
+                let began = Instant::now();
+                let labels = parser.parse(&aligned.transform.cut(&photo, parser.side()))?;
+                parser_seconds = Some(began.elapsed().as_secs_f64());
+                Some(labels)
+            }
             (None, None) => None,
         };
-        Ok(Self { source: path.display().to_string(), aligned, labels, warnings })
+        Ok(Self { source: path.display().to_string(), aligned, labels, parser_seconds, warnings })
     }
 }
 
@@ -100,11 +113,16 @@ pub fn read(path: &Path) -> Result<RgbImage> {
 }
 
 /// ITU-R BT.601 luma, as the detector was trained on.
-pub fn luma(photo: &RgbImage) -> GrayImage {
-    GrayImage::from_fn(photo.width(), photo.height(), |x, y| {
-        let [red, green, blue] = photo.get_pixel(x, y).0.map(u32::from);
-        Luma([((299 * red + 587 * green + 114 * blue + 500) / 1000) as u8])
-    })
+pub fn luma(photo: &RgbImage) -> Result<GrayImage> {
+    let size = ImageSize { width: photo.width() as usize, height: photo.height() as usize };
+    let convert = || -> Result<Vec<u8>, ImageError> {
+        let mut grey = Image::<u8, 1>::from_size_val(size, 0)?;
+        gray_from_rgb_u8(&Image::<u8, 3>::new(size, photo.as_raw().clone())?, &mut grey)?;
+        Ok(grey.into_vec())
+    };
+    let values = convert().map_err(|error| Error::malformed("the photo's luma", error))?;
+    GrayImage::from_raw(photo.width(), photo.height(), values)
+        .ok_or_else(|| Error::malformed("the photo's luma", "has another size than the photo"))
 }
 
 /// A photo's label map cut as the photo is: the nearest label, mirrored beyond the edges. A map of another size than
@@ -146,7 +164,19 @@ mod tests {
     }
 
     #[test]
+    fn luma_is_bt_601s() {
+        let photo = RgbImage::from_fn(7, 5, |x, y| image::Rgb([(x * 40) as u8, (y * 60) as u8, (x * y * 10) as u8]));
+        for (pixel, grey) in photo.pixels().zip(luma(&photo).unwrap().pixels()) {
+            let [red, green, blue] = pixel.0.map(f64::from);
+            let exact = 0.299 * red + 0.587 * green + 0.114 * blue;
+            // Half a level of rounding and a little of the weights' own.
+            assert!((exact - f64::from(grey.0[0])).abs() < 0.52, "{pixel:?} {grey:?}");
+        }
+    }
+
+    #[test]
     fn label_maps_are_cut_as_the_photo_is() {
+        use image::Luma;
         let folder = tempfile::tempdir().unwrap();
         let mask = folder.path().join("mask.png");
         // Region 5 in the square around her nose at (225, 125), in a map of half the photo's size.

@@ -152,7 +152,7 @@ impl Pivot {
         objective::ray_loss(&output, level, &pixels, &self.weights())
     }
 
-    fn whole_loss(&self, generator: &Generator, target: &Target) -> Result<Loss> {
+    pub(crate) fn whole_loss(&self, generator: &Generator, target: &Target) -> Result<Loss> {
         let codes = self.live_codes()?;
         let picture = whole_picture(generator, &codes, self.live_global()?.as_ref(), self.camera.as_tensor(), true)?;
         whole_loss(&picture, target, &self.weights())

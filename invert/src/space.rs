@@ -44,7 +44,12 @@ impl CodeSpace {
 
     /// The model's codes `[N, D]` of whitened ones `[N, D]`. Differentiable.
     pub fn to_codes(&self, whitened: &Tensor) -> Result<Tensor> {
-        Ok(whitened.matmul(&self.spread)?.broadcast_add(&self.mean)?)
+        Ok(self.displaced(whitened)?.broadcast_add(&self.mean)?)
+    }
+
+    /// How far whitened displacements `[N, D]` move the model's codes, `[N, D]`. Differentiable.
+    pub fn displaced(&self, whitened: &Tensor) -> Result<Tensor> {
+        Ok(whitened.matmul(&self.spread)?)
     }
 
     /// The model's codes `[1, 9, 2, D]` of whitened rows `[18, D]`, or of one row `[1, D]` given to all of them.

@@ -8,7 +8,8 @@ use cnerf_core::{data::picture, eval::perceptual::Perceptual, model::generator::
 use cnerf_invert::{
     config::InvertConfig,
     events::Event,
-    inverter::{Inversion, Inverter},
+    inverter::{Inversion, Inverter, estimate_seconds},
+    parser::{ParserConfig, RegionParser},
     photo::{PhotoOptions, Subject},
 };
 use serde::Serialize;
@@ -33,6 +34,8 @@ pub struct InvertArguments {
     /// Label map of the photo's regions (8-bit PNG, `cnerf-9`)
     #[arg(long, value_name = "FILE")]
     mask: Option<PathBuf>,
+    #[command(flatten)]
+    parser: ParserConfig,
     /// The head's azimuth and elevation, radians, if known
     #[arg(long, value_name = "A,E", value_parser = pose, allow_hyphen_values = true)]
     pose: Option<[f64; 2]>,
@@ -49,6 +52,14 @@ pub struct InvertArguments {
     model: ModelOptions,
     #[command(flatten)]
     overwrite: OverwriteOptions,
+}
+
+/// What all photos are inverted with.
+#[derive(Clone, Copy)]
+struct Tools<'a> {
+    generator: &'a Generator,
+    perceptual: Option<&'a Perceptual>,
+    parser: Option<&'a dyn RegionParser>,
 }
 
 #[derive(Default, Serialize)]
@@ -87,14 +98,27 @@ impl InvertArguments {
         if self.photos.len() > 1 && (self.mask.is_some() || self.pose.is_some()) {
             bail!("--mask and --pose belong to one photo; invert photos that need them one by one");
         }
-        for photo in &self.photos {
-            self.overwrite.check(&self.output(photo))?;
+        for (index, photo) in self.photos.iter().enumerate() {
+            let output = self.output(photo);
+            self.overwrite.check(&output)?;
+            if let Some(other) = self.photos.iter().take(index).find(|other| self.output(other) == output) {
+                let (photo, other, output) = (photo.display(), other.display(), output.display());
+                bail!("{photo} and {other} would both become {output}: rename one, or invert them apart");
+            }
         }
         let generator = self.model.load_or("portrait")?;
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
+        let parser = self.parser.load()?;
+        let tools = Tools { generator: &generator, perceptual: perceptual.as_ref(), parser: parser.as_deref() };
+        if !console.is_quiet() {
+            let seconds = estimate_seconds(&generator, &self.config, tools.perceptual)?;
+            let (effort, count) = (self.config.effort.name(), self.photos.len());
+            let photos = if count == 1 { "the photo".to_owned() } else { format!("each of {count} photos") };
+            console.note(format_args!("{effort} effort: about {} for {photos}", duration(seconds)));
+        }
         let mut report = Report::default();
         for photo in &self.photos {
-            match self.invert(photo, &generator, perceptual.as_ref(), console) {
+            match self.invert(photo, &tools, console) {
                 Ok(inverted) => {
                     let Inverted { output, psnr, seconds, .. } = &inverted;
                     console.note(format_args!("{}: {psnr:.1} dB in {seconds:.0} s", output.display()));
@@ -134,16 +158,14 @@ impl InvertArguments {
         self.out.join(stem(photo)).with_extension("cnerf")
     }
 
-    fn invert(
-        &self,
-        photo: &Path,
-        generator: &Generator,
-        perceptual: Option<&Perceptual>,
-        console: &Console,
-    ) -> anyhow::Result<Inverted> {
+    fn invert(&self, photo: &Path, tools: &Tools<'_>, console: &Console) -> anyhow::Result<Inverted> {
+        let Tools { generator, perceptual, parser } = *tools;
         let began = std::time::Instant::now();
         let options = PhotoOptions { face: self.face, aligned: self.aligned, pose: self.pose, mask: self.mask.clone() };
-        let subject = Subject::read(photo, &options, None, generator.output_resolution() as u32)?;
+        let subject = Subject::read(photo, &options, parser, generator.output_resolution() as u32)?;
+        if let Some(seconds) = subject.parser_seconds {
+            console.note(format_args!("{}: regions parsed in {seconds:.1} s", photo.display()));
+        }
         let model_name = self.model.model.as_deref().unwrap_or("portrait");
         let mut inverter = Inverter::new(generator, model_name, subject, self.config.clone(), perceptual)?;
         let mut bar = console.bar(0, "pivot");
@@ -187,6 +209,11 @@ impl InvertArguments {
             steps_tune: metrics.steps_tune,
         })
     }
+}
+
+/// Seconds as people say them.
+fn duration(seconds: f64) -> String {
+    if seconds < 90.0 { format!("{:.0} s", seconds.max(1.0)) } else { format!("{:.0} min", seconds / 60.0) }
 }
 
 fn pose(text: &str) -> Result<[f64; 2], String> {

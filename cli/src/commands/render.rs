@@ -1,4 +1,5 @@
-//! `cnerf render`: multi-view sequences of a portrait, of a random one, or of several blended one into the next.
+//! `cnerf render`: multi-view sequences of a portrait, of a random one, or of several blended one into the next, and
+//! pages to turn a portrait on.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +8,10 @@ use candle_core::Tensor;
 use clap::Args;
 use cnerf_core::{
     camera::Camera,
-    interop::animation::{self, Format},
+    interop::{
+        animation::{self, Format},
+        page::{Grid, Page},
+    },
     model::generator::Generator,
     region::RegionSet,
     render::trajectory::Trajectory,
@@ -17,9 +21,9 @@ use serde::Serialize;
 
 use crate::{
     console::{Console, Outcome},
-    options::{ModelOptions, OverwriteOptions},
+    options::{ModelOptions, OverwriteOptions, stem},
     portraits,
-    views::{Scene, View, side_by_side},
+    views::{Scene, Stereo, View, side_by_side},
 };
 
 /// Arguments of `cnerf render`.
@@ -37,8 +41,17 @@ pub struct RenderArguments {
     #[arg(long, default_value_t = 20.0, value_name = "FPS")]
     fps: f64,
     /// Where to: .gif, .apng, .mp4 (needs ffmpeg), .png (a picture or a sheet), or a folder of frames
-    #[arg(long, value_name = "PATH")]
-    out: PathBuf,
+    #[arg(long, value_name = "PATH", required_unless_present = "html")]
+    out: Option<PathBuf>,
+    /// Write one page with everything in it, to turn the head with the mouse and show regions and layers
+    #[arg(long, value_name = "FILE.html", conflicts_with_all = ["out", "trajectory", "frames", "stereo", "output"])]
+    html: Option<PathBuf>,
+    /// Views of the page, across and up
+    #[arg(long, value_name = "XxY", default_value = "15x5", value_parser = grid)]
+    grid: [usize; 2],
+    /// Render for two eyes
+    #[arg(long, value_enum, value_name = "KIND")]
+    stereo: Option<Stereo>,
     /// What to render; several stand side by side
     #[arg(long, value_enum, value_delimiter = ',', default_value = "rgb")]
     output: Vec<View>,
@@ -53,6 +66,10 @@ pub struct RenderArguments {
     #[command(flatten)]
     overwrite: OverwriteOptions,
 }
+
+/// How far a page's views reach, radians: a little beyond what the models have seen.
+const PAGE_AZIMUTH_RAD: f64 = 0.6;
+const PAGE_ELEVATION_RAD: f64 = 0.25;
 
 #[derive(Serialize)]
 struct Report {
@@ -73,9 +90,13 @@ struct Key {
 impl RenderArguments {
     /// Renders the frames and writes them.
     pub fn run(self, seed: Option<u64>, console: &Console) -> anyhow::Result<Outcome> {
-        let format = Format::of(&self.out)?;
-        if format == Format::Folder || !self.out.is_dir() {
-            self.overwrite.check(&self.out)?;
+        if let Some(path) = &self.html {
+            return self.page(path, seed, console);
+        }
+        let Some(out) = self.out.clone() else { bail!("--out: say where to write") };
+        // A folder in the way of a file is told when it is written; an existing folder of frames needs --overwrite.
+        if Format::of(&out)? == Format::Folder || !out.is_dir() {
+            self.overwrite.check(&out)?;
         }
         if self.output.is_empty() {
             bail!("--output: name at least one of rgb, seg, depth, normal");
@@ -90,10 +111,10 @@ impl RenderArguments {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        animation::save(&frames, self.fps, &self.out)?;
+        animation::save(&frames, self.fps, &out)?;
         let (width, height) = frames.first().map_or((0, 0), RgbImage::dimensions);
         let report =
-            Report { output: self.out, frames: frames.len(), width, height, seconds: began.elapsed().as_secs_f64() };
+            Report { output: out, frames: frames.len(), width, height, seconds: began.elapsed().as_secs_f64() };
         console.result(&report, || {
             format!(
                 "{}: {} frames of {width}x{height} in {:.1} s",
@@ -101,6 +122,47 @@ impl RenderArguments {
                 report.frames,
                 report.seconds
             )
+        })?;
+        Ok(Outcome::Done)
+    }
+
+    /// Renders the grid of views and writes the page.
+    fn page(&self, path: &Path, seed: Option<u64>, console: &Console) -> anyhow::Result<Outcome> {
+        if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
+            bail!("{}: name the page .html", path.display());
+        }
+        self.overwrite.check(path)?;
+        let began = std::time::Instant::now();
+        let [columns, rows] = self.grid;
+        let grid = Grid::even(columns, rows, PAGE_AZIMUTH_RAD, PAGE_ELEVATION_RAD)?;
+        let keys = self.keys(seed)?;
+        let [key] = keys.as_slice() else { bail!("--html shows one portrait; {} are named", keys.len()) };
+        let scene = key.scene(self.regions);
+        let cameras = grid.cameras();
+        let bar = console.bar(cameras.len() as u64, "page");
+        let mut frames = Vec::with_capacity(cameras.len());
+        for camera in &cameras {
+            frames.push(scene.page_frame(camera)?);
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        let title = match (self.portraits.first(), seed) {
+            (Some(portrait), _) => stem(portrait),
+            (None, seed) => format!("seed {}", seed.unwrap_or_default()),
+        };
+        let side = frames.first().map_or(0, |frame| frame.portrait.width());
+        Page { title, grid, frames }.save(path)?;
+        let report = Report {
+            output: path.to_owned(),
+            frames: cameras.len(),
+            width: side,
+            height: side,
+            seconds: began.elapsed().as_secs_f64(),
+        };
+        console.result(&report, || {
+            let bytes = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
+            let megabytes = bytes as f64 / 1e6;
+            format!("{}: {} views, {megabytes:.1} MB, in {:.1} s", path.display(), report.frames, report.seconds)
         })?;
         Ok(Outcome::Done)
     }
@@ -134,9 +196,17 @@ impl RenderArguments {
             _ => None,
         };
         let key = blended.as_ref().unwrap_or(from);
-        let scene =
-            Scene { generator: &key.generator, codes: &key.codes, global: key.global.as_ref(), regions: self.regions };
-        Ok(side_by_side(&scene.pictures(camera, &self.output)?))
+        let scene = key.scene(self.regions);
+        let Some(stereo) = self.stereo else { return Ok(side_by_side(&scene.pictures(camera, &self.output)?)) };
+        let [left, right] = Stereo::cameras(camera);
+        let (left, right) = (scene.pictures(&left, &self.output)?, scene.pictures(&right, &self.output)?);
+        Ok(side_by_side(&left.iter().zip(&right).map(|(left, right)| stereo.join(left, right)).collect::<Vec<_>>()))
+    }
+}
+
+impl Key {
+    fn scene(&self, regions: RegionSet) -> Scene<'_> {
+        Scene { generator: &self.generator, codes: &self.codes, global: self.global.as_ref(), regions }
     }
 }
 
@@ -160,6 +230,14 @@ fn mix(from: &Key, to: &Key, amount: f64) -> anyhow::Result<Key> {
     let device = from.generator.device();
     let generator = Generator::from_tensors(from.generator.config(), weights, &device)?;
     Ok(Key { generator, codes: between(&from.codes, &to.codes)?, global })
+}
+
+fn grid(text: &str) -> Result<[usize; 2], String> {
+    let parts: Vec<usize> = text.split('x').map_while(|part| part.trim().parse().ok()).collect();
+    match parts.as_slice() {
+        [columns, rows] if (2..=63).contains(columns) && (2..=63).contains(rows) => Ok([*columns, *rows]),
+        _ => Err("must be views across x views up, 2 to 63 each, e.g. 15x5".into()),
+    }
 }
 
 fn trajectory(name: &str) -> Result<Trajectory, String> {

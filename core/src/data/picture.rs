@@ -6,7 +6,7 @@
 
 use std::{
     fs::File,
-    io::{Cursor, Read as _, Write as _},
+    io::{Cursor, Read as _},
     path::Path,
 };
 
@@ -17,7 +17,10 @@ use image::{
 };
 pub use image::{GrayImage, RgbImage};
 
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    files::write_atomically,
+};
 
 /// Largest width and height of a picture that is read, pixels.
 pub const MAX_SIDE: u32 = 8192;
@@ -38,28 +41,6 @@ pub fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>> {
         ));
     }
     Ok(bytes)
-}
-
-/// Writes a file whole or not at all: to a temporary file in the same folder, then renamed over `path`.
-pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, error))?;
-    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(|error| Error::io(path, error))?;
-    file.write_all(bytes).map_err(|error| Error::io(path, error))?;
-    publish(file, path)
-}
-
-/// Renames a temporary file to `path` with the permissions a plain `File::create` would have given it.
-pub(crate) fn publish(file: tempfile::NamedTempFile, path: &Path) -> Result<()> {
-    // Temporary files are private to their owner; a result is not.
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt as _;
-        let shared = std::fs::Permissions::from_mode(0o644);
-        file.as_file().set_permissions(shared).map_err(|error| Error::io(path, error))?;
-    }
-    file.persist(path).map_err(|error| Error::io(path, error.error))?;
-    Ok(())
 }
 
 /// Reads a photo (PNG, JPEG, WebP, BMP or GIF), upright as its EXIF orientation says; see [`decode`].
@@ -246,7 +227,7 @@ pub fn write(path: &Path, picture: &RgbImage) -> Result<()> {
         "jpg" | "jpeg" => encode_jpeg(picture, 95)?,
         _ => return Err(Error::malformed(path, "pictures are written as .png or .jpg; name the file so")),
     };
-    write_file(path, &bytes)
+    write_atomically(path, &bytes)
 }
 
 /// Pictures of one size as a tensor `[B, 3, H, W]`, f32 in [-1, 1].

@@ -14,7 +14,7 @@ use image::RgbImage;
 use super::sheet::{Sheet, save_png};
 use crate::{
     error::{Error, Result},
-    model::file::write_atomically,
+    files::write_atomically,
 };
 
 /// What a sequence of frames is written as.

@@ -41,7 +41,7 @@ pub fn permute_regions(tensor: &Tensor, dimension: usize) -> Result<Tensor> {
         return Err(Error::shape("regions", REGION_COUNT, tensor.dims()));
     }
     let places = authors_places().map(|place| place as u32);
-    Ok(tensor.index_select(&Tensor::new(&places, tensor.device())?, dimension)?)
+    Ok(tensor.contiguous()?.index_select(&Tensor::new(&places, tensor.device())?, dimension)?)
 }
 
 /// The authors' codes `[B, 18, D]` (row 2i shape of region i, row 2i + 1 its texture) as ours, `[B, 9, 2, D]`.

@@ -5,27 +5,12 @@ use std::collections::HashMap;
 
 use candle_core::Tensor;
 
+use super::authors::permute_regions;
 use crate::{
     config::{UpsamplerConfig, UpsamplerKind, UpsamplerStyle},
     error::{Error, Result},
     model::discriminator::{DiscriminatorConfig, DiscriminatorKind},
-    region::{REGION_COUNT, Region},
 };
-
-/// Row `r` of the authors' order for each of our regions.
-const AUTHORS_ROW: [u32; REGION_COUNT] = {
-    let mut rows = [0, 1, 2, 3, 4, 5, 6, 7, 8];
-    rows[Region::Eyebrows as usize] = 4;
-    rows[Region::Mouth as usize] = 3;
-    rows
-};
-
-/// Reorders the regions along dimension `dimension` of a tensor, from the authors' order to ours or back: swapping the
-/// mouth and the eyebrows is its own inverse.
-pub fn reorder_regions(tensor: &Tensor, dimension: usize) -> Result<Tensor> {
-    let rows = Tensor::new(&AUTHORS_ROW, tensor.device())?;
-    Ok(tensor.contiguous()?.index_select(&rows, dimension)?)
-}
 
 /// The configuration of the upsampler in a generator's state dict `authors`, read off its tensors' shapes.
 ///
@@ -142,7 +127,7 @@ fn convert(sources: &[Source], authors: &HashMap<String, Tensor>) -> Result<Hash
             _ => tensor.clone(),
         };
         let tensor = match source.regions {
-            Some(dimension) => reorder_regions(&tensor, dimension)?,
+            Some(dimension) => permute_regions(&tensor, dimension)?,
             None => tensor,
         };
         Ok((source.ours.clone(), tensor))
@@ -286,13 +271,5 @@ mod tests {
             let skip = |source: &Source| source.ours.contains(".skip.") && !ours.contains(&source.ours);
             assert_complete(&parameters, sources.into_iter().filter(|source| !skip(source)).collect());
         }
-    }
-
-    #[test]
-    fn mouth_and_eyebrows_change_places() {
-        let rows = Tensor::arange(0u32, 9, &Device::Cpu).unwrap();
-        let ours = reorder_regions(&rows, 0).unwrap();
-        assert_eq!(ours.to_vec1::<u32>().unwrap(), [0, 1, 2, 4, 3, 5, 6, 7, 8]);
-        assert_eq!(reorder_regions(&ours, 0).unwrap().to_vec1::<u32>().unwrap(), rows.to_vec1::<u32>().unwrap());
     }
 }

@@ -7,7 +7,7 @@ use image::{ImageFormat, Rgb, RgbImage, imageops};
 
 use crate::{
     error::{Error, Result},
-    model::file::write_atomically,
+    files::write_atomically,
 };
 
 const GAP: u32 = 4;

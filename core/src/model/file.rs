@@ -5,7 +5,6 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
-    io::Write as _,
     path::Path,
 };
 
@@ -17,6 +16,7 @@ use sha2::{Digest as _, Sha256};
 use crate::{
     config::GeneratorConfig,
     error::{Error, Result},
+    files::write_atomically,
 };
 
 /// Largest file read into memory; a hostile size is refused before anything is allocated.
@@ -145,34 +145,6 @@ pub fn safetensors_bytes(name: &Path, tensors: &Tensors, metadata: &[(&str, Stri
         .collect::<Result<Vec<_>>>()?;
     let metadata = metadata.iter().map(|(key, value)| ((*key).to_owned(), value.clone())).collect();
     safetensors::serialize(views, Some(metadata)).map_err(|error| Error::malformed(name, error))
-}
-
-/// Writes `bytes` to a temporary file in the folder of `path` and renames it: readers see all of it or nothing.
-pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    let failed = |error| Error::io(path, error);
-    std::fs::create_dir_all(folder).map_err(failed)?;
-    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(failed)?;
-    file.write_all(bytes).map_err(failed)?;
-    file.as_file().sync_all().map_err(failed)?;
-    make_readable(file.path()).map_err(failed)?;
-    file.persist(path).map_err(|error| Error::io(path, error.error))?;
-    Ok(())
-}
-
-/// Temporary files are private to their owner; what the suite leaves behind is readable like any other output.
-#[cfg(unix)]
-fn make_readable(path: &Path) -> std::io::Result<()> {
-    use std::os::unix::fs::PermissionsExt as _;
-    std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o644))
-}
-
-#[cfg(not(unix))]
-fn make_readable(_: &Path) -> std::io::Result<()> {
-    Ok(())
 }
 
 fn raw(tensor: &Tensor) -> Result<(StoredDtype, Vec<usize>, Vec<u8>)> {

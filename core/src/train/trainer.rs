@@ -18,6 +18,7 @@ use crate::{
     data::dataset::Dataset,
     error::{Error, Result},
     eval::perceptual::Perceptual,
+    files,
     model::{
         file::{self, Tensors},
         generator::Generator,
@@ -116,7 +117,7 @@ impl Trainer {
             ));
         }
         let trainer = Self::open(config, stage, inputs, run)?;
-        file::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
+        files::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
         Ok(trainer)
     }
 
@@ -264,7 +265,7 @@ impl Trainer {
         let written = current.stage.samples().and_then(|picture| {
             let mut bytes = std::io::Cursor::new(Vec::new());
             picture.write_to(&mut bytes, image::ImageFormat::Png).map_err(|error| Error::malformed(&path, error))?;
-            file::write_atomically(&path, bytes.get_ref())
+            files::write_atomically(&path, bytes.get_ref())
         });
         match written {
             Ok(()) => Event::Samples(path),

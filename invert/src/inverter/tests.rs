@@ -11,7 +11,7 @@ use cnerf_core::{
 use super::*;
 use crate::{
     align::{Aligned, CropTransform},
-    edit::{self, Edit, Source},
+    edit::{self, Colour, Edit, Goal, Source},
     error::Error,
 };
 
@@ -55,6 +55,7 @@ fn subject(generator: &Generator, with_labels: bool) -> Subject {
         source: "made up".into(),
         aligned: Aligned { picture, transform, camera: Camera::at(0.1, 0.0), padded: 0.0 },
         labels: with_labels.then_some(labels),
+        parser_seconds: None,
         warnings: vec!["something to know".into()],
     }
 }
@@ -149,19 +150,24 @@ fn texture_edits_move_no_depth_and_can_be_undone() {
     let labels = LabelMap::from_masks(&opened.picture(&portrait.camera).unwrap().masks.squeeze(0).unwrap()).unwrap();
     let largest = Region::ALL.into_iter().skip(1).max_by_key(|region| labels.counts()[region.index()]).unwrap();
     let texture = Edit { regions: largest.into(), aspect: Aspect::Texture, source: Source::Seed(3), amount: 1.0 };
-    let source = edit::source_codes(&generator, &texture.source, None).unwrap();
-    let edited = edit::apply(&mut portrait, path, &generator, &[(texture.clone(), source)]).unwrap();
+    let goal = Goal::of(&texture.source, &generator, None, None).unwrap();
+    let thumbnail = portrait.thumbnail.clone();
+    let edited = edit::apply(&mut portrait, path, &generator, &[(texture.clone(), goal)]).unwrap();
     assert_eq!(edited.change.depth_change, 0.0, "{:?}", edited.change);
     assert!(edited.change.inside_change > 2.0 * edited.change.outside_change, "{:?}", edited.change);
     assert_eq!(portrait.history.len(), 1);
 
     let shape = Edit { regions: Region::Face.into(), aspect: Aspect::Shape, source: Source::Mean, amount: 0.7 };
-    let mean = edit::source_codes(&generator, &shape.source, None).unwrap();
+    let mean = Goal::of(&shape.source, &generator, None, None).unwrap();
     let edited = edit::apply(&mut portrait, path, &generator, &[(shape, mean)]).unwrap();
     assert!(edited.change.depth_change > 0.0);
+    assert_ne!(portrait.thumbnail, thumbnail);
 
-    portrait.undo(path).unwrap();
-    assert_eq!(portrait.undo(path).unwrap().edit, texture);
+    let (_, undone) = edit::undo(&mut portrait, path, &generator).unwrap();
+    assert_eq!((undone.before, undone.change), (edited.after, edited.change));
+    assert_eq!(edit::undo(&mut portrait, path, &generator).unwrap().0.edit, texture);
+    assert_eq!(portrait.thumbnail, thumbnail);
+    assert!(matches!(edit::undo(&mut portrait, path, &generator), Err(Error::NothingToUndo { .. })));
     assert_eq!(portrait.codes.flatten_all().unwrap().to_vec1::<f32>().unwrap(), before);
 }
 
@@ -172,11 +178,107 @@ fn senseless_edits_are_refused() {
     let (inversion, _) = run(&generator, subject(&generator, false), config);
     let mut portrait = inversion.portrait;
     let mut refuse = |edit: Edit| {
-        let source = edit::source_codes(&generator, &Source::Mean, None).unwrap();
-        edit::apply(&mut portrait, Path::new("a.cnerf"), &generator, &[(edit, source)]).unwrap_err().to_string()
+        let goal = Goal::of(&edit.source, &generator, None, None).unwrap();
+        edit::apply(&mut portrait, Path::new("a.cnerf"), &generator, &[(edit, goal)]).unwrap_err().to_string()
     };
     let edit = Edit { regions: Region::Hair.into(), aspect: Aspect::Both, source: Source::Mean, amount: 1.0 };
     assert!(refuse(Edit { amount: f64::NAN, ..edit.clone() }).contains("--amount"));
     assert!(refuse(Edit { regions: Default::default(), ..edit }).contains("--region"));
     assert!(portrait.history.is_empty());
+}
+
+/// A portrait of the small generator, and the region that shows most in it (a small model's regions lie anywhere).
+fn portrait_and_region(generator: &Generator) -> (Portrait, Region) {
+    let config = InvertConfig { pivot_steps: Some(10), tune_steps: Some(0), ..config() };
+    let (inversion, _) = run(generator, subject(generator, false), config);
+    let portrait = inversion.portrait;
+    let counts = edit::own_map(&portrait, Path::new("a.cnerf"), generator).unwrap().counts();
+    let largest = Region::ALL.into_iter().skip(1).max_by_key(|region| counts[region.index()]).unwrap();
+    (portrait, largest)
+}
+
+#[test]
+fn a_colour_edit_reaches_its_colour_and_moves_no_depth() {
+    let generator = small_generator(3);
+    let (mut portrait, region) = portrait_and_region(&generator);
+    let path = Path::new("a.cnerf");
+    let opened = Opened::new(&portrait, path, &generator).unwrap();
+    // A colour that the model can make: another portrait's.
+    let codes = cnerf_core::codes::blend(
+        &opened.codes,
+        &generator.codes_from_seed(5, 1.0).unwrap(),
+        region.into(),
+        Aspect::Texture,
+        1.0,
+    )
+    .unwrap();
+    let other = Opened { codes, ..opened.clone() };
+    let wanted = edit::mean_colour(&other, &portrait.camera, region).unwrap().unwrap();
+    let own = edit::mean_colour(&opened, &portrait.camera, region).unwrap().unwrap();
+    let away = edit::perceived_difference(own, wanted).unwrap();
+    assert!(away > 4.0, "the test needs colours that differ: {away}");
+    let colour = Colour(wanted.map(|value| ((value + 1.0) * 127.5).round() as u8));
+    let edit = Edit { regions: region.into(), aspect: Aspect::Texture, source: Source::Colour(colour), amount: 1.0 };
+    let edited = edit::apply(&mut portrait, path, &generator, &[(edit, Goal::Colour(colour))]).unwrap();
+    let left = edited.colour_difference.unwrap();
+    assert!(left < 0.3 * away && left < 3.0, "{left} of {away} is left");
+    assert_eq!(edited.change.depth_change, 0.0);
+}
+
+#[test]
+fn a_painted_map_draws_the_shapes_towards_it() {
+    let generator = small_generator(3);
+    let (mut portrait, _) = portrait_and_region(&generator);
+    let path = Path::new("a.cnerf");
+    let own = edit::own_map(&portrait, path, &generator).unwrap();
+    // A map the model can show: another portrait's from the same camera.
+    let opened = Opened::new(&portrait, path, &generator).unwrap();
+    let codes = generator.codes_from_seed(5, 1.0).unwrap();
+    let codes = cnerf_core::codes::blend(&opened.codes, &codes, cnerf_core::region::RegionSet::ALL, Aspect::Shape, 1.0);
+    let other = Opened { codes: codes.unwrap(), ..opened };
+    let painted =
+        LabelMap::from_masks(&other.picture(&portrait.camera).unwrap().masks.squeeze(0).unwrap()).unwrap();
+    let off = |map: &LabelMap| map.labels().iter().zip(painted.labels()).filter(|(a, b)| a != b).count();
+    let before = off(&own);
+    assert!(before > 60, "the test needs maps that differ: {before} of 1024 pixels");
+    let source = Source::Painted("map.png".into());
+    let edit = Edit { regions: Default::default(), aspect: Aspect::Shape, source, amount: 1.0 };
+    edit::apply(&mut portrait, path, &generator, &[(edit.clone(), Goal::Painted(painted.clone()))]).unwrap();
+    let after = off(&edit::own_map(&portrait, path, &generator).unwrap());
+    assert!(2 * after < before, "{before} pixels differed, {after} still do");
+    assert!(!portrait.history[0].0.edit.regions.is_empty(), "the history says which regions were moved");
+
+    let same = edit::own_map(&portrait, path, &generator).unwrap();
+    let error = edit::apply(&mut portrait, path, &generator, &[(edit, Goal::Painted(same))]).unwrap_err();
+    assert!(error.to_string().contains("--mask-paint"), "{error}");
+}
+
+#[test]
+fn directions_are_a_regions_own_strongest_first() {
+    let generator = small_generator(3);
+    let film = |codes: &Tensor| generator.field().film(codes).unwrap();
+    let mean = generator.mean_codes().unwrap();
+    // What a step along a direction changes in the hair's shape layers.
+    let effect = |direction: &Tensor| {
+        let moved = mean.broadcast_add(&direction.reshape((1, 1, 1, 16)).unwrap()).unwrap();
+        let change = (film(&moved) - film(&mean)).unwrap().narrow(1, Region::Hair.index(), 1).unwrap();
+        let change = change.narrow(2, 0, 3).unwrap().sqr().unwrap().sum_all().unwrap();
+        f64::from(change.to_scalar::<f32>().unwrap())
+    };
+    let hair = edit::directions(&generator, Region::Hair.into(), Aspect::Shape, 8).unwrap();
+    let effects: Vec<f64> = (0..8).map(|index| effect(&hair.get(index).unwrap())).collect();
+    assert!(effects.windows(2).all(|pair| pair[0] >= pair[1] * 0.999), "{effects:?}");
+    // No random direction of unit variance does more than the first.
+    let space = crate::space::CodeSpace::measure(&generator).unwrap();
+    let mut random = cnerf_core::rng::Stream::new(2, &[]);
+    for _ in 0..20 {
+        let step = random.normal_tensor(&[1, 16], &Device::Cpu).unwrap();
+        let norm = step.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
+        let step = space.displaced(&(step / f64::from(norm)).unwrap()).unwrap();
+        assert!(effect(&step) <= effects[0] * 1.001);
+    }
+    let eyes = edit::directions(&generator, Region::Eyes.into(), Aspect::Shape, 1).unwrap();
+    let apart = (eyes.get(0).unwrap() - hair.get(0).unwrap()).unwrap().abs().unwrap().max_all().unwrap();
+    assert!(apart.to_scalar::<f32>().unwrap() > 1e-3, "each region has its own");
+    assert!(edit::directions(&generator, Region::Eyes.into(), Aspect::Shape, 17).is_err());
 }

@@ -22,6 +22,7 @@ use crate::{
         picture::{self, RgbImage},
     },
     error::{Error, Result},
+    files,
 };
 
 /// How photos are stored.
@@ -165,7 +166,7 @@ impl DatasetWriter {
             Target::Zip(writer) => {
                 let writer = writer.finish().map_err(|error| Error::io(path, error.into()))?;
                 let file = writer.into_inner().map_err(|error| Error::io(path, error.into_error()))?;
-                picture::publish(file, path)
+                files::publish(file, path)
             }
             Target::Folder(folder) => {
                 #[cfg(unix)]

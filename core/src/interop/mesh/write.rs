@@ -13,7 +13,7 @@ use gltf_json::{
 use super::Mesh;
 use crate::{
     error::{Error, Result},
-    model::file::write_atomically,
+    files::write_atomically,
     region::{Region, RegionSet},
 };
 

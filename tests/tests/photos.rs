@@ -1,0 +1,132 @@
+//! Real photos as people have them: turned by their camera, with several people, too dark, several at once; and face
+//! parsers brought along.
+
+use std::{fs, path::Path};
+
+use cnerf_tests::{Folder, MODEL, number};
+use image::{RgbImage, codecs::jpeg::JpegEncoder, imageops};
+
+/// Steps that show inversion works without waiting for a good likeness.
+const FEW_STEPS: &str = "--pivot-steps 6 --tune-steps 1";
+
+/// A JPEG whose EXIF block says how it is to be turned.
+fn jpeg_with_orientation(picture: &RgbImage, orientation: u8) -> Vec<u8> {
+    let mut jpeg = Vec::new();
+    JpegEncoder::new_with_quality(&mut jpeg, 95).encode_image(picture).unwrap();
+    // One TIFF directory, little-endian, of one entry: tag 0x112, a short.
+    let mut exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
+    let length = (exif.len() as u16 + 2).to_be_bytes();
+    [&jpeg[..2], b"\xff\xe1", &length, &exif, &jpeg[2..]].concat()
+}
+
+/// The aligned photo: the first cell of the picture that `invert` writes.
+fn aligned(folder: &Folder, name: &str) -> RgbImage {
+    let strip = folder.picture(name);
+    imageops::crop_imm(&strip, 0, 0, strip.height(), strip.height()).to_image()
+}
+
+#[test]
+fn a_photo_is_turned_as_its_camera_says() {
+    let folder = Folder::with_model("orientation");
+    folder.photo("astronaut.png");
+    let upright = folder.picture("astronaut.png");
+    folder.write("upright.jpg", &jpeg_with_orientation(&upright, 1));
+    folder.write("turned.jpg", &jpeg_with_orientation(&imageops::rotate270(&upright), 6));
+    let report = folder.json(&format!("invert upright.jpg turned.jpg --model {MODEL} --out out {FEW_STEPS}"));
+    assert_eq!(report["portraits"].as_array().map(Vec::len), Some(2), "{report}");
+    let [one, two] = ["out/upright.png", "out/turned.png"].map(|name| aligned(&folder, name));
+    let apart: u64 = one.iter().zip(two.iter()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+    // Compressed along other axes, found again by the detector: the crops may differ by a fraction of a pixel.
+    assert!(apart < 6 * one.len() as u64, "mean difference {}", apart as f64 / one.len() as f64);
+}
+
+#[test]
+fn of_several_people_one_is_chosen_by_number() {
+    let folder = Folder::with_model("faces");
+    folder.photo("astronaut.png");
+    let astronaut = folder.picture("astronaut.png");
+    let mut pair = RgbImage::new(900, 512);
+    let small = imageops::resize(&astronaut, 330, 330, imageops::FilterType::Triangle);
+    imageops::replace(&mut pair, &small, 0, 0);
+    imageops::replace(&mut pair, &astronaut, 380, 0);
+    pair.save(folder.path("pair.png")).unwrap();
+    let line = format!("invert pair.png --model {MODEL} {FEW_STEPS}");
+    let run = folder.run(&format!("{line} --out first --no-progress")).done();
+    assert!(run.stderr.contains("2 faces, number 0 is taken (0: ") && run.stderr.contains("; 1: "), "{}", run.stderr);
+    assert!(run.stderr.contains("effort: about "), "the time is told ahead: {}", run.stderr);
+    folder.run(&format!("{line} --face 1 --out second")).done();
+    assert!(aligned(&folder, "first/pair.png") != aligned(&folder, "second/pair.png"), "the same face twice");
+    let run = folder.run(&format!("{line} --face 2 --out third --quiet"));
+    assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{}", run.stderr);
+    assert!(run.stderr.contains("pair.png") && run.stderr.contains("1: "), "{}", run.stderr);
+}
+
+#[test]
+fn dark_and_faceless_photos_fail_one_by_one() {
+    let folder = Folder::with_model("dark");
+    folder.photo("astronaut.png");
+    let mut dark = folder.picture("astronaut.png");
+    dark.iter_mut().for_each(|value| *value /= 12);
+    dark.save(folder.path("dark.png")).unwrap();
+    RgbImage::from_pixel(200, 200, image::Rgb([90, 120, 150])).save(folder.path("sky.png")).unwrap();
+    let photos = "dark.png astronaut.png sky.png gone.png";
+    let run = folder.run(&format!("invert {photos} --model {MODEL} --out out {FEW_STEPS} --json --quiet"));
+    assert_eq!(run.code, 1, "{}", run.stderr);
+    let report = run.json();
+    assert_eq!(report["portraits"][0]["input"], "astronaut.png");
+    let failed = report["failed"].as_array().unwrap();
+    let said = |index: usize| failed[index]["error"].as_str().unwrap().to_owned();
+    assert!(said(0).contains("dark.png") && (said(0).contains("dark (") || said(0).contains("no face")), "{}", said(0));
+    assert!(said(1).contains("sky.png: no face found"), "{}", said(1));
+    assert_eq!(said(2), "gone.png: no such file or folder; check its name");
+    assert_eq!(folder.list("out"), ["astronaut.cnerf", "astronaut.png"]);
+}
+
+#[test]
+fn photos_of_one_name_do_not_overwrite_each_other() {
+    let folder = Folder::with_model("same_name");
+    for place in ["a", "b"] {
+        fs::create_dir(folder.path(place)).unwrap();
+        folder.photo(&format!("{place}/me.png"));
+    }
+    let run = folder.run(&format!("invert a/me.png b/me.png --model {MODEL} --out out {FEW_STEPS} --overwrite"));
+    assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{}", run.stderr);
+    assert!(run.stderr.contains("a/me.png") && run.stderr.contains("b/me.png"), "{}", run.stderr);
+}
+
+#[test]
+fn files_that_are_no_parsers_are_refused_in_a_line() {
+    let folder = Folder::with_model("bad_parser");
+    folder.photo("astronaut.png");
+    folder.write("text.onnx", b"this is no network");
+    folder.write("empty.onnx", b"");
+    let line = format!("invert astronaut.png --model {MODEL} --out out {FEW_STEPS} --parser");
+    for (option, said) in [
+        ("text.onnx", "text.onnx"),
+        ("empty.onnx", "empty.onnx"),
+        ("gone.onnx", "no such file"),
+        ("text.onnx --parser-classes hair,beard", "`beard`"),
+    ] {
+        let run = folder.run(&format!("{line} {option}"));
+        assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{option}: {}", run.stderr);
+        assert!(run.stderr.contains(said), "{option}: {}", run.stderr);
+    }
+    assert!(!folder.path("out").exists());
+}
+
+#[test]
+fn a_face_parser_gives_the_regions() {
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/weights/face_parser_bisenetv2_448.onnx");
+    if !weights.exists() {
+        println!("skipped: {} is absent", weights.display());
+        return;
+    }
+    let folder = Folder::with_model("parser");
+    folder.photo("astronaut.png");
+    let line = format!("invert astronaut.png --model {MODEL} {FEW_STEPS}");
+    assert!(folder.json(&format!("{line} --out plain"))["portraits"][0]["mask_miou"].is_null());
+    let run = folder.run(&format!("{line} --parser {} --out parsed --json --no-progress", weights.display())).done();
+    assert!(run.stderr.contains("regions parsed in"), "{}", run.stderr);
+    assert!(number(&run.json()["portraits"][0], "mask_miou") > 0.0);
+}
