@@ -46,7 +46,13 @@ fn one_line(message: &str) -> String {
         .filter(|line| !line.is_empty());
     let mut joined = String::new();
     for line in said {
-        joined.push_str(if joined.is_empty() { "" } else if joined.ends_with(':') { " " } else { "; " });
+        joined.push_str(if joined.is_empty() {
+            ""
+        } else if joined.ends_with(':') {
+            " "
+        } else {
+            "; "
+        });
         joined.push_str(line);
     }
     format!("{joined}; try --help")
@@ -145,9 +151,13 @@ mod tests {
     fn a_mistake_is_told_in_one_line() {
         let message = "error: unexpected argument '--sedes' found\n\n  tip: a similar argument exists: '--seeds'\n\n\
                        Usage: cnerf generate --out <DIR>\n\nFor more information, try '--help'.\n";
-        let expected = "error: unexpected argument '--sedes' found; tip: a similar argument exists: '--seeds'; try --help";
+        let expected =
+            "error: unexpected argument '--sedes' found; tip: a similar argument exists: '--seeds'; try --help";
         assert_eq!(one_line(message), expected);
         let missing = "error: the following required arguments were not provided:\n  --out <DIR>\n\nUsage: cnerf\n";
-        assert_eq!(one_line(missing), "error: the following required arguments were not provided: --out <DIR>; try --help");
+        assert_eq!(
+            one_line(missing),
+            "error: the following required arguments were not provided: --out <DIR>; try --help"
+        );
     }
 }

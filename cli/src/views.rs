@@ -61,11 +61,14 @@ impl Stereo {
         match self {
             Self::Side => side_by_side(&[left.clone(), right.clone()]),
             // A grey left eye avoids the flicker between eyes that red skin or a blue flag would give.
-            Self::Anaglyph => RgbImage::from_fn(left.width().min(right.width()), left.height().min(right.height()), |x, y| {
-                let ([red, green, blue], [_, right_green, right_blue]) = (left.get_pixel(x, y).0, right.get_pixel(x, y).0);
-                let grey = 0.299 * f64::from(red) + 0.587 * f64::from(green) + 0.114 * f64::from(blue);
-                image::Rgb([grey.round() as u8, right_green, right_blue])
-            }),
+            Self::Anaglyph => {
+                RgbImage::from_fn(left.width().min(right.width()), left.height().min(right.height()), |x, y| {
+                    let ([red, green, blue], [_, right_green, right_blue]) =
+                        (left.get_pixel(x, y).0, right.get_pixel(x, y).0);
+                    let grey = 0.299 * f64::from(red) + 0.587 * f64::from(green) + 0.114 * f64::from(blue);
+                    image::Rgb([grey.round() as u8, right_green, right_blue])
+                })
+            }
         }
     }
 }
@@ -162,6 +165,9 @@ mod tests {
         let [left, right] = [[200, 100, 0], [1, 2, 3]].map(|colour| RgbImage::from_pixel(4, 4, Rgb(colour)));
         assert_eq!(Stereo::Anaglyph.join(&left, &right).get_pixel(1, 1).0, [119, 2, 3]);
         let side = Stereo::Side.join(&left, &right);
-        assert_eq!((side.dimensions(), side.get_pixel(3, 0).0, side.get_pixel(4, 0).0), ((8, 4), [200, 100, 0], [1, 2, 3]));
+        assert_eq!(
+            (side.dimensions(), side.get_pixel(3, 0).0, side.get_pixel(4, 0).0),
+            ((8, 4), [200, 100, 0], [1, 2, 3])
+        );
     }
 }

@@ -119,7 +119,8 @@ mod tests {
 
     #[test]
     fn a_missing_file_is_told_once_with_the_remedy() {
-        let error = std::fs::read("nowhere/at_all.bin").map_err(|error| Error::io("nowhere/at_all.bin", error)).unwrap_err();
+        let error =
+            std::fs::read("nowhere/at_all.bin").map_err(|error| Error::io("nowhere/at_all.bin", error)).unwrap_err();
         assert_eq!(error.to_string(), "nowhere/at_all.bin: no such file or folder; check its name");
         assert!(std::error::Error::source(&error).is_none(), "a chain would say it twice");
     }

@@ -16,7 +16,7 @@ use image::{Luma, RgbImage};
 
 use crate::{
     config::InvertConfig,
-    error::Result,
+    error::{Error, Result},
     events::Event,
     objective::Target,
     photo::Subject,
@@ -38,8 +38,8 @@ pub struct Inverter<'a> {
     perceptual: Option<&'a Perceptual>,
     config: InvertConfig,
     model: ModelName,
-    subject: Subject,
-    target: Target,
+    subjects: Vec<Subject>,
+    targets: Vec<Target>,
     pivot: Pivot,
     tune: Option<Tune>,
     settled: bool,
@@ -81,15 +81,34 @@ impl<'a> Inverter<'a> {
         config: InvertConfig,
         perceptual: Option<&'a Perceptual>,
     ) -> Result<Self> {
+        Self::of_person(generator, model_name, vec![subject], config, perceptual)
+    }
+
+    /// Prepares the inversion of several photos of one person: they will share codes and weights, each has its own
+    /// camera, and steps take them in turn. Otherwise as [`Self::new`].
+    pub fn of_person(
+        generator: &'a Generator,
+        model_name: &str,
+        subjects: Vec<Subject>,
+        config: InvertConfig,
+        perceptual: Option<&'a Perceptual>,
+    ) -> Result<Self> {
         let started = Instant::now();
         config.validate()?;
-        let target = Target::new(&subject.aligned.picture, subject.labels.as_ref(), generator, perceptual)?;
-        let pivot = Pivot::new(generator, &subject.aligned.camera, &config)?;
-        let pending = subject.warnings.iter().cloned().map(Event::Warning).collect();
+        if subjects.is_empty() {
+            return Err(Error::config("photos", "at least one is needed"));
+        }
+        let target =
+            |subject: &Subject| Target::new(&subject.aligned.picture, subject.labels.as_ref(), generator, perceptual);
+        let targets = subjects.iter().map(target).collect::<Result<_>>()?;
+        let cameras: Vec<Camera> = subjects.iter().map(|subject| subject.aligned.camera).collect();
+        let pivot = Pivot::new(generator, &cameras, &config)?;
+        let pending =
+            subjects.iter().flat_map(|subject| subject.warnings.iter().cloned().map(Event::Warning)).collect();
         let model = ModelName { name: model_name.to_owned(), hash: generator.hash()? };
         let seconds = started.elapsed().as_secs_f64();
         let (tune, settled) = (None, false);
-        Ok(Self { generator, perceptual, config, model, subject, target, pivot, tune, settled, pending, seconds })
+        Ok(Self { generator, perceptual, config, model, subjects, targets, pivot, tune, settled, pending, seconds })
     }
 
     /// Does one step and says what happened; `None` when nothing is left to do.
@@ -105,13 +124,13 @@ impl<'a> Inverter<'a> {
 
     fn advance(&mut self) -> Result<Option<Event>> {
         if !self.pivot.is_done() {
-            return Ok(Some(Event::Pivot(self.pivot.step(self.generator, &self.target)?)));
+            return Ok(Some(Event::Pivot(self.pivot.step(self.generator, &self.targets)?)));
         }
         let tune = match &mut self.tune {
             Some(tune) => tune,
             None => {
-                let frozen =
-                    Frozen { codes: self.pivot.codes()?, global: self.pivot.global()?, camera: self.pivot.camera()? };
+                let (codes, global, cameras) = (self.pivot.codes()?, self.pivot.global()?, self.pivot.cameras()?);
+                let frozen = Frozen { codes, global, cameras };
                 self.tune.insert(Tune::new(self.generator, frozen, &self.config)?)
             }
         };
@@ -122,78 +141,100 @@ impl<'a> Inverter<'a> {
             self.settled = true;
             return Ok(Some(Event::Settled { step: tune.steps_done() }));
         }
-        Ok(Some(Event::Tune(tune.step(self.generator, self.pivot.space(), &self.target)?)))
+        Ok(Some(Event::Tune(tune.step(self.generator, self.pivot.space(), &self.targets)?)))
     }
 
-    /// The portrait as it stands; usually after [`Self::step`] has returned `None`.
-    pub fn finish(mut self) -> Result<Inversion> {
-        let started = Instant::now();
-        let (codes, global, camera) = (self.pivot.codes()?, self.pivot.global()?, self.pivot.camera()?);
-        let view = Camera::parameter_tensor(&[camera], &self.generator.device())?;
-        let show =
-            |generator: &Generator, view: &Tensor| whole_picture(generator, &codes, global.as_ref(), view, false);
+    /// The portrait as it stands (the first photo's); usually after [`Self::step`] has returned `None`.
+    pub fn finish(self) -> Result<Inversion> {
+        let first = self.finish_all()?.into_iter().next();
+        first.ok_or_else(|| Error::config("photos", "at least one is needed"))
+    }
 
-        let deltas = match &mut self.tune {
+    /// The portraits of all photos as they stand, in order.
+    pub fn finish_all(mut self) -> Result<Vec<Inversion>> {
+        let started = Instant::now();
+        let tuned = match &mut self.tune {
             Some(tune) => {
-                let tuned = tune.best_weights(&self.target)?;
-                Deltas::between(&self.generator.parameters().snapshot()?, &tuned)?
+                let weights = tune.best_weights(&self.targets)?;
+                Deltas::between(&self.generator.parameters().snapshot()?, &weights)?
             }
             None => Deltas::default(),
         };
-        // Everything shown and measured is what the file gives back, rounding included.
-        let tuned = deltas.generator(self.generator)?;
-        let pivot_picture = show(self.generator, &view)?;
-        let picture = show(&tuned, &view)?;
+        let whole = Whole {
+            codes: self.pivot.codes()?,
+            global: self.pivot.global()?,
+            // Everything shown and measured is what the file gives back, rounding included.
+            generator: tuned.generator(self.generator)?,
+            deltas: tuned,
+        };
+        let depth_drift = self.tune.as_ref().map_or(Ok(0.0), |tune| tune.depth_drift(&whole.generator))?;
+        let photos = self.subjects.iter().zip(&self.targets).zip(self.pivot.cameras()?);
+        let mut inversions = photos
+            .map(|((subject, target), camera)| self.finish_one(subject, target, camera, &whole, depth_drift))
+            .collect::<Result<Vec<_>>>()?;
+        let seconds = self.seconds + started.elapsed().as_secs_f64();
+        inversions.iter_mut().for_each(|inversion| inversion.portrait.metrics.seconds = seconds);
+        Ok(inversions)
+    }
+
+    fn finish_one(
+        &self,
+        subject: &Subject,
+        target: &Target,
+        camera: Camera,
+        whole: &Whole,
+        depth_drift: f64,
+    ) -> Result<Inversion> {
+        let Whole { codes, global, generator: tuned, deltas } = whole;
+        let view = |camera: Camera| Camera::parameter_tensor(&[camera], &self.generator.device());
+        let show = |generator: &Generator, view: &Tensor| whole_picture(generator, codes, global.as_ref(), view, false);
+        let pivot_picture = show(self.generator, &view(camera)?)?;
+        let picture = show(tuned, &view(camera)?)?;
         let side = |turn: f64| -> Result<RgbImage> {
             let turned = Camera { azimuth_rad: camera.azimuth_rad + turn, ..camera };
-            one_picture(&show(&tuned, &Camera::parameter_tensor(&[turned], &self.generator.device())?)?.rgb)
+            one_picture(&show(tuned, &view(turned)?)?.rgb)
         };
         let tuned_rgb = one_picture(&picture.rgb)?;
         let panels = Panels {
-            photo: one_picture(&self.target.output.colour)?,
+            photo: one_picture(&target.output.colour)?,
             pivot: one_picture(&pivot_picture.rgb)?,
             regions: LabelMap::from_masks(&picture.masks.squeeze(0)?)?.colours(),
             depth: depth_picture(&picture, tuned_rgb.width())?,
             novel: [side(-NOVEL_VIEW_RAD)?, side(NOVEL_VIEW_RAD)?],
             tuned: tuned_rgb,
         };
-        let depth_drift = match &self.tune {
-            Some(tune) => tune.depth_drift(&tuned)?,
-            None => 0.0,
-        };
         let metrics = Metrics {
-            pivot_psnr: psnr(&pivot_picture.rgb, &self.target.output.colour)?,
+            pivot_psnr: psnr(&pivot_picture.rgb, &target.output.colour)?,
             depth_drift,
             steps_pivot: self.config.steps().pivot(),
             steps_tune: self.tune.as_ref().map_or(0, Tune::steps_done),
-            ..self.measure(&picture)?
+            ..self.measure(&picture, target)?
         };
-        let metrics = Metrics { seconds: self.seconds + started.elapsed().as_secs_f64(), ..metrics };
         let portrait = Portrait {
-            model: self.model,
-            source: self.subject.source,
-            crop: Some(self.subject.aligned.transform),
+            model: self.model.clone(),
+            source: subject.source.clone(),
+            crop: Some(subject.aligned.transform),
             codes: codes.squeeze(0)?,
-            upsampler_code: global.map(|code| code.squeeze(0)).transpose()?,
+            upsampler_code: global.as_ref().map(|code| code.squeeze(0)).transpose()?,
             camera,
-            deltas,
+            deltas: deltas.clone(),
             noise: Vec::new(),
             thumbnail: picture::resize(&panels.tuned, THUMBNAIL, THUMBNAIL)?,
-            config: self.config,
+            config: self.config.clone(),
             metrics,
             history: Vec::new(),
         };
         Ok(Inversion { portrait, panels })
     }
 
-    fn measure(&self, picture: &Picture) -> Result<Metrics> {
-        let photo = &self.target.output.colour;
+    fn measure(&self, picture: &Picture, target: &Target) -> Result<Metrics> {
+        let photo = &target.output.colour;
         let rgb = picture.rgb.clamp(-1.0, 1.0)?;
         let lpips = match self.perceptual {
             Some(perceptual) => perceptual.distance(&rgb, photo)?.to_vec1::<f32>()?.first().copied().map(f64::from),
             None => None,
         };
-        let mask_miou = match &self.target.output.masks {
+        let mask_miou = match &target.output.masks {
             Some(known) => {
                 let mut agreement = Agreement::default();
                 agreement.add(
@@ -207,6 +248,17 @@ impl<'a> Inverter<'a> {
         let ms_ssim = quality::ms_ssim(&rgb, photo)?.values.first().copied().unwrap_or(0.0);
         Ok(Metrics { psnr: psnr(&rgb, photo)?, ms_ssim, lpips, mask_miou, ..Metrics::default() })
     }
+}
+
+/// What all photos of a person share.
+struct Whole {
+    /// `[1, 9, 2, D]`.
+    codes: Tensor,
+    /// `[1, L]`.
+    global: Option<Tensor>,
+    /// With the tuned weights.
+    generator: Generator,
+    deltas: Deltas,
 }
 
 /// The tuned generator of a portrait, and its codes and camera as tensors: all that rendering it needs.
@@ -252,12 +304,13 @@ pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, perceptual
     let steps = config.steps();
     // A pivot of a single step takes it on rays, with as many rays as the effort has.
     let single = InvertConfig { pivot_steps: Some(1), ..config.clone() };
-    let mut pivot = Pivot::new(generator, &Camera::default(), &single)?;
+    let mut pivot = Pivot::new(generator, &[Camera::default()], &single)?;
     let started = Instant::now();
-    pivot.step(generator, &target)?;
+    pivot.step(generator, std::slice::from_ref(&target))?;
     let on_rays = started.elapsed().as_secs_f64();
     let started = Instant::now();
-    pivot.whole_loss(generator, &target)?.total.backward()?;
+    let view = Camera::parameter_tensor(&[Camera::default()], &generator.device())?;
+    pivot.whole_loss(generator, &target, &view)?.total.backward()?;
     let whole = started.elapsed().as_secs_f64();
     let steps_on_rays = (steps.shared + steps.free) as f64;
     // What was done here is done again: the space of codes, the target's features.

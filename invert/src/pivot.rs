@@ -2,7 +2,8 @@
 //!
 //! Coarse to fine: first one code for all rows and rays of the field alone, then every row free, then whole pictures
 //! at the output resolution. Codes live in whitened coordinates ([`CodeSpace`]), held to the model's distribution by
-//! their mean square and to one person by their spread around their mean.
+//! their mean square and to one person by their spread around their mean. Several photos of one person share the codes;
+//! each has its own camera, and steps take them in turn.
 
 use candle_core::{Tensor, Var};
 use cnerf_core::{
@@ -43,22 +44,25 @@ pub struct Pivot {
     rows: Var,
     /// Whitened global code of the upsampler, `[1, D]`, if it has one.
     global: Option<Var>,
-    /// `[1, 6]`, see [`Camera::parameters`].
-    camera: Var,
-    first_camera: Tensor,
+    /// One a photo, `[1, 6]` each, see [`Camera::parameters`].
+    cameras: Vec<Var>,
+    first_cameras: Vec<Tensor>,
     moves_camera: bool,
     optimiser: Adam,
     step: usize,
 }
 
 impl Pivot {
-    /// Starts at the model's mean portrait, seen by `camera`.
-    pub fn new(generator: &Generator, camera: &Camera, config: &InvertConfig) -> Result<Self> {
+    /// Starts at the model's mean portrait, seen by one of `cameras` in each photo.
+    pub fn new(generator: &Generator, cameras: &[Camera], config: &InvertConfig) -> Result<Self> {
         let space = CodeSpace::measure(generator)?;
         let device = generator.device();
         let zeros = |rows: usize| Var::zeros((rows, space.style_dim()), candle_core::DType::F32, &device);
         let global = matches!(&generator.config().upsampler, Some(u) if u.style == UpsamplerStyle::Global);
-        let first_camera = Camera::parameter_tensor(&[*camera], &device)?;
+        let first_cameras = cameras
+            .iter()
+            .map(|camera| Ok(Camera::parameter_tensor(&[*camera], &device)?))
+            .collect::<Result<Vec<_>>>()?;
         let mut pivot = Self {
             config: config.pivot.clone(),
             steps: config.steps(),
@@ -66,8 +70,8 @@ impl Pivot {
             shared: zeros(1)?,
             rows: zeros(2 * REGION_COUNT)?,
             global: if global { Some(zeros(1)?) } else { None },
-            camera: Var::from_tensor(&first_camera)?,
-            first_camera,
+            cameras: first_cameras.iter().map(Var::from_tensor).collect::<candle_core::Result<_>>()?,
+            first_cameras,
             moves_camera: !config.fixed_camera,
             optimiser: Adam::new(Vec::new(), BETAS),
             step: 0,
@@ -97,22 +101,30 @@ impl Pivot {
         &self.space
     }
 
-    /// The camera as it is now.
-    pub fn camera(&self) -> Result<Camera> {
-        let values: Vec<f32> = self.camera.as_tensor().flatten_all()?.to_vec1()?;
-        let mut parameters = [0.0; CAMERA_PARAMETERS];
-        parameters.iter_mut().zip(&values).for_each(|(parameter, value)| *parameter = f64::from(*value));
-        Ok(Camera::from_parameters(parameters))
+    /// The cameras as they are now, one a photo.
+    pub fn cameras(&self) -> Result<Vec<Camera>> {
+        let camera = |camera: &Var| {
+            let values: Vec<f32> = camera.as_tensor().flatten_all()?.to_vec1()?;
+            let mut parameters = [0.0; CAMERA_PARAMETERS];
+            parameters.iter_mut().zip(&values).for_each(|(parameter, value)| *parameter = f64::from(*value));
+            Ok(Camera::from_parameters(parameters))
+        };
+        self.cameras.iter().map(camera).collect()
     }
 
-    /// One step.
-    pub fn step(&mut self, generator: &Generator, target: &Target) -> Result<StepReport> {
+    /// One step, on the photo whose turn it is; `targets` are as many as there are cameras.
+    pub fn step(&mut self, generator: &Generator, targets: &[Target]) -> Result<StepReport> {
         if self.step == self.steps.shared {
             self.rows.set(&self.shared.as_tensor().broadcast_as(self.rows.shape())?.contiguous()?)?;
             self.optimiser = self.optimiser_of(self.rows.clone());
         }
         let whole = self.step >= self.steps.shared + self.steps.free;
-        let loss = if whole { self.whole_loss(generator, target)? } else { self.ray_loss(generator, target)? };
+        let (target, camera) = self.turn(targets)?;
+        let loss = if whole {
+            self.whole_loss(generator, target, &camera)?
+        } else {
+            self.ray_loss(generator, target, &camera)?
+        };
         let total = (loss.total.clone() + self.regularisation()?)?;
         let value = objective::scalar(&total)?;
         if !value.is_finite() {
@@ -122,6 +134,15 @@ impl Pivot {
         self.optimiser.step(&total.backward()?, SCHEDULE.factor(position, length))?;
         self.step += 1;
         Ok(StepReport { step: self.step, total: self.steps.pivot(), loss: value, psnr: loss.psnr() })
+    }
+
+    /// The photo whose turn it is, and its camera.
+    fn turn<'a>(&self, targets: &'a [Target]) -> Result<(&'a Target, Tensor)> {
+        let index = self.step % self.cameras.len().max(1);
+        match (targets.get(index), self.cameras.get(index)) {
+            (Some(target), Some(camera)) => Ok((target, camera.as_tensor().clone())),
+            _ => Err(cnerf_core::Error::shape("photos", [self.cameras.len()], &[targets.len()]).into()),
+        }
     }
 
     /// The step within the phase of the present optimiser, and that phase's length.
@@ -141,20 +162,20 @@ impl Pivot {
         self.global.as_ref().map(|code| self.space.to_codes(code.as_tensor())).transpose()
     }
 
-    fn ray_loss(&self, generator: &Generator, target: &Target) -> Result<Loss> {
+    fn ray_loss(&self, generator: &Generator, target: &Target, camera: &Tensor) -> Result<Loss> {
         let mut random = Stream::new(self.seed, &[STREAM, self.step as u64]);
         let level = &target.render;
         let pixels = objective::draw_pixels(level.resolution, self.steps.rays, &mut random, &generator.device())?;
         let field = generator.field().portraits(&self.live_codes()?)?;
         let sampling = generator.render_settings().sampling;
-        let camera = self.camera.as_tensor();
         let output = objective::render_pixels(&field, camera, &pixels, level.resolution, &sampling, &mut random)?;
         objective::ray_loss(&output, level, &pixels, &self.weights())
     }
 
-    pub(crate) fn whole_loss(&self, generator: &Generator, target: &Target) -> Result<Loss> {
+    /// The loss of the whole picture seen by `camera`.
+    pub(crate) fn whole_loss(&self, generator: &Generator, target: &Target, camera: &Tensor) -> Result<Loss> {
         let codes = self.live_codes()?;
-        let picture = whole_picture(generator, &codes, self.live_global()?.as_ref(), self.camera.as_tensor(), true)?;
+        let picture = whole_picture(generator, &codes, self.live_global()?.as_ref(), camera, true)?;
         whole_loss(&picture, target, &self.weights())
     }
 
@@ -175,8 +196,11 @@ impl Pivot {
         }
         let [angle, shift, zoom] = self.config.camera_prior.map(|deviation| 1.0 / deviation.max(1e-6) as f32);
         let scale = Tensor::new(&[[angle, angle, angle, shift, shift, zoom]], rows.device())?;
-        let moved = ((self.camera.as_tensor() - &self.first_camera)? * scale)?;
-        Ok((total + (moved.sqr()?.sum_all()? * self.config.camera)?)?)
+        for (camera, first) in self.cameras.iter().zip(&self.first_cameras) {
+            let moved = ((camera.as_tensor() - first)? * &scale)?;
+            total = (total + (moved.sqr()?.sum_all()? * self.config.camera)?)?;
+        }
+        Ok(total)
     }
 
     fn optimiser_of(&self, codes: Var) -> Adam {
@@ -185,7 +209,8 @@ impl Pivot {
         let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
         let mut groups = vec![group(variables, self.config.code_rate)];
         if self.moves_camera {
-            groups.push(group(vec![("camera".to_owned(), self.camera.clone())], self.config.camera_rate));
+            let named = |(index, camera): (usize, &Var)| (format!("camera{index}"), camera.clone());
+            groups.push(group(self.cameras.iter().enumerate().map(named).collect(), self.config.camera_rate));
         }
         Adam::new(groups, BETAS)
     }

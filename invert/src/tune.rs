@@ -21,7 +21,7 @@ use crate::{
     config::{InvertConfig, PivotConfig, Steps, TuneConfig},
     error::Result,
     events::StepReport,
-    objective::{self, PhotoWeights, Target},
+    objective::{self, Loss, PhotoWeights, Target},
     pivot::{whole_loss, whole_picture},
     space::CodeSpace,
 };
@@ -44,8 +44,8 @@ pub struct Frozen {
     pub codes: Tensor,
     /// The upsampler's global code `[1, D]`, if it has one.
     pub global: Option<Tensor>,
-    /// The camera that sees the photo.
-    pub camera: Camera,
+    /// The cameras that see the photos, one each.
+    pub cameras: Vec<Camera>,
 }
 
 /// The running optimisation.
@@ -56,7 +56,8 @@ pub struct Tune {
     seed: u64,
     generator: Generator,
     frozen: Frozen,
-    camera: Tensor,
+    /// One a photo, `[1, 6]`.
+    cameras: Vec<Tensor>,
     off_views: Vec<OffView>,
     optimiser: Adam,
     step: usize,
@@ -100,9 +101,13 @@ impl Tune {
     /// Tunes a copy of `original`.
     pub fn new(original: &Generator, frozen: Frozen, config: &InvertConfig) -> Result<Self> {
         let generator = original.duplicate()?;
-        let camera = Camera::parameter_tensor(&[frozen.camera], &generator.device())?;
-        let off_views = off_views(&frozen.camera, config.tune.off_view_rad)
-            .into_iter()
+        let cameras = frozen.cameras.iter();
+        let cameras = cameras.map(|camera| Ok(Camera::parameter_tensor(&[*camera], &generator.device())?));
+        let cameras = cameras.collect::<Result<Vec<_>>>()?;
+        let off_views = frozen
+            .cameras
+            .iter()
+            .flat_map(|camera| off_views(camera, config.tune.off_view_rad))
             .map(|view| {
                 let camera = Camera::parameter_tensor(&[view], &generator.device())?;
                 Ok(OffView { depth: depth(original, &frozen.codes, &camera)?, camera })
@@ -119,7 +124,7 @@ impl Tune {
             seed: config.seed,
             generator,
             frozen,
-            camera,
+            cameras,
             off_views,
             optimiser: Adam::new(groups, Betas { first: 0.9, second: 0.99 }),
             step: 0,
@@ -143,12 +148,10 @@ impl Tune {
         self.step
     }
 
-    /// One step; `original` is the generator tuning began with.
-    pub fn step(&mut self, original: &Generator, space: &CodeSpace, target: &Target) -> Result<StepReport> {
+    /// One step; `original` is the generator tuning began with, `targets` are as many as there are cameras.
+    pub fn step(&mut self, original: &Generator, space: &CodeSpace, targets: &[Target]) -> Result<StepReport> {
         let mut random = Stream::new(self.seed, &[STREAM, self.step as u64]);
-        let Frozen { codes, global, .. } = &self.frozen;
-        let picture = whole_picture(&self.generator, codes, global.as_ref(), &self.camera, true)?;
-        let photo = whole_loss(&picture, target, &self.weights)?;
+        let photo = self.photo_loss(self.step, targets, true)?;
         let psnr = photo.psnr();
         let photo_loss = objective::scalar(&photo.total)?;
         let mut total = (photo.total + (self.depth_loss(&mut random)? * self.config.depth)?)?;
@@ -159,9 +162,13 @@ impl Tune {
         if !value.is_finite() {
             return Err(cnerf_core::Error::not_finite("the tuning's loss").into());
         }
-        // Judged by the photo alone: the other terms are drawn anew every step.
+        // Judged by the photo alone: the other terms are drawn anew every step. Photos differ in how well they can be
+        // shown: with several, weights are compared where all have had their turn.
         self.progress.add(photo_loss);
-        self.keep_if_best(photo_loss)?;
+        if self.step.is_multiple_of(self.cameras.len().max(1)) {
+            let all = self.all_photos(targets, (self.cameras.len() == 1).then_some(photo_loss))?;
+            self.keep_if_best(all)?;
+        }
         self.optimiser.step(&total.backward()?, SCHEDULE.factor(self.step, self.steps.tune))?;
         self.step += 1;
         Ok(StepReport { step: self.step, total: self.steps.tune, loss: value, psnr })
@@ -169,12 +176,31 @@ impl Tune {
 
     /// The weights that showed the photo best, of all steps and the last one's outcome, by name. Never worse at that
     /// than the pivot: the first step saw its weights.
-    pub fn best_weights(&mut self, target: &Target) -> Result<BTreeMap<String, Tensor>> {
-        let Frozen { codes, global, .. } = &self.frozen;
-        let picture = whole_picture(&self.generator, codes, global.as_ref(), &self.camera, false)?;
-        let loss = objective::scalar(&whole_loss(&picture, target, &self.weights)?.total)?;
+    pub fn best_weights(&mut self, targets: &[Target]) -> Result<BTreeMap<String, Tensor>> {
+        let loss = self.all_photos(targets, None)?;
         self.keep_if_best(loss)?;
         Ok(self.best.take().map(|best| best.weights).unwrap_or_default())
+    }
+
+    /// The loss of the photo whose turn `turn` is.
+    fn photo_loss(&self, turn: usize, targets: &[Target], differentiable: bool) -> Result<Loss> {
+        let index = turn % self.cameras.len().max(1);
+        let (Some(target), Some(camera)) = (targets.get(index), self.cameras.get(index)) else {
+            return Err(cnerf_core::Error::shape("photos", [self.cameras.len()], &[targets.len()]).into());
+        };
+        let Frozen { codes, global, .. } = &self.frozen;
+        let picture = whole_picture(&self.generator, codes, global.as_ref(), camera, differentiable)?;
+        whole_loss(&picture, target, &self.weights)
+    }
+
+    /// The sum of all photos' losses with the weights as they are; `known` if it is known already.
+    fn all_photos(&self, targets: &[Target], known: Option<f64>) -> Result<f64> {
+        match known {
+            Some(loss) => Ok(loss),
+            None => (0..targets.len())
+                .map(|turn| objective::scalar(&self.photo_loss(turn, targets, false)?.total))
+                .sum::<Result<f64>>(),
+        }
     }
 
     fn keep_if_best(&mut self, loss: f64) -> Result<()> {
@@ -231,7 +257,7 @@ impl Tune {
     }
 }
 
-/// The photo's camera turned to both sides.
+/// A photo's camera turned to both sides.
 fn off_views(camera: &Camera, turn_rad: f64) -> [Camera; 2] {
     [-turn_rad, turn_rad].map(|turn| Camera { azimuth_rad: camera.azimuth_rad + turn, ..*camera })
 }

@@ -1,10 +1,6 @@
 //! Edits and what is made of portraits: colours, painted maps, directions, undoing, pages, stereo pairs, animations.
 
-use std::{
-    env, fs,
-    path::PathBuf,
-    process::Command,
-};
+use std::{env, fs, path::PathBuf, process::Command};
 
 use cnerf_tests::{DATA, Folder, MODEL, MODEL_SIZE, has_content, number};
 use image::{AnimationDecoder as _, codecs::png::PngDecoder, imageops};
@@ -21,7 +17,9 @@ fn folder_with_portrait(name: &str) -> Folder {
 /// The program `name` on PATH.
 fn program(names: &[&str]) -> Option<PathBuf> {
     let path = env::var_os("PATH")?;
-    env::split_paths(&path).flat_map(|folder| names.iter().map(move |name| folder.join(name))).find(|file| file.is_file())
+    env::split_paths(&path)
+        .flat_map(|folder| names.iter().map(move |name| folder.join(name)))
+        .find(|file| file.is_file())
 }
 
 /// Bytes of the thumbnail in the portrait file `name`.

@@ -130,3 +130,20 @@ fn a_face_parser_gives_the_regions() {
     assert!(run.stderr.contains("regions parsed in"), "{}", run.stderr);
     assert!(number(&run.json()["portraits"][0], "mask_miou") > 0.0);
 }
+#[test]
+fn photos_of_one_person_share_codes_and_keep_their_cameras() {
+    let folder = Folder::with_model("same_person");
+    folder.photo("left.png");
+    imageops::flip_horizontal(&folder.picture("left.png")).save(folder.path("right.png")).unwrap();
+    let line = format!("invert left.png right.png --same-person --model {MODEL} --out out {FEW_STEPS}");
+    let report = folder.json(&line);
+    assert_eq!(report["portraits"].as_array().map(Vec::len), Some(2), "{report}");
+    let azimuth = |index: usize| number(&report["portraits"][index], "azimuth");
+    assert!(azimuth(0) != azimuth(1), "each photo has its own camera");
+    let codes = |name: &str| {
+        let bytes = folder.read(name);
+        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        file.tensor("codes").unwrap().data().to_vec()
+    };
+    assert!(codes("out/left.cnerf") == codes("out/right.cnerf"), "one person, one set of codes");
+}

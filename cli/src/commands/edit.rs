@@ -178,7 +178,11 @@ impl EditArguments {
     fn edits(&self, seed: Option<u64>) -> anyhow::Result<Vec<(Edit, Files<'_>)>> {
         let way = &self.way;
         if seed.is_some()
-            && (way.mean || !way.from.is_empty() || !way.color.is_empty() || way.mask_paint.is_some() || way.direction.is_some())
+            && (way.mean
+                || !way.from.is_empty()
+                || !way.color.is_empty()
+                || way.mask_paint.is_some()
+                || way.direction.is_some())
         {
             bail!("--seed takes a random portrait's codes; leave it out where another source is named");
         }

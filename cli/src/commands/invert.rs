@@ -45,6 +45,9 @@ pub struct InvertArguments {
     /// The photos are framed like the training portraits already
     #[arg(long)]
     aligned: bool,
+    /// The photos show one person: share codes and tuned weights, with a camera for each
+    #[arg(long)]
+    same_person: bool,
     /// LPIPS weights (AlexNet or VGG16, safetensors) for a perceptual loss
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
@@ -117,18 +120,15 @@ impl InvertArguments {
             console.note(format_args!("{effort} effort: about {} for {photos}", duration(seconds)));
         }
         let mut report = Report::default();
-        for photo in &self.photos {
-            match self.invert(photo, &tools, console) {
-                Ok(inverted) => {
-                    let Inverted { output, psnr, seconds, .. } = &inverted;
-                    console.note(format_args!("{}: {psnr:.1} dB in {seconds:.0} s", output.display()));
-                    report.portraits.push(inverted);
-                }
-                Err(error) => {
-                    if self.photos.len() > 1 {
-                        console.error(&error);
-                    }
-                    report.failed.push(Failed { input: photo.clone(), error: format!("{error:#}") });
+        let groups: Vec<&[PathBuf]> =
+            if self.same_person { vec![&self.photos] } else { self.photos.chunks(1).collect() };
+        for photos in groups {
+            let failed = report.failed.len();
+            let subjects = self.read(photos, &tools, &mut report, console);
+            if let Err(error) = self.invert(subjects, &tools, &mut report, console) {
+                let unread = report.failed.iter().skip(failed).map(|one| one.input.clone()).collect::<Vec<_>>();
+                for photo in photos.iter().filter(|photo| !unread.contains(photo)) {
+                    self.fail(photo, &error, &mut report, console);
                 }
             }
         }
@@ -158,19 +158,55 @@ impl InvertArguments {
         self.out.join(stem(photo)).with_extension("cnerf")
     }
 
-    fn invert(&self, photo: &Path, tools: &Tools<'_>, console: &Console) -> anyhow::Result<Inverted> {
-        let Tools { generator, perceptual, parser } = *tools;
-        let began = std::time::Instant::now();
+    /// Reads photos; those that cannot be used are reported and left out.
+    fn read<'p>(
+        &self,
+        photos: &'p [PathBuf],
+        tools: &Tools<'_>,
+        report: &mut Report,
+        console: &Console,
+    ) -> Vec<(&'p Path, Subject)> {
         let options = PhotoOptions { face: self.face, aligned: self.aligned, pose: self.pose, mask: self.mask.clone() };
-        let subject = Subject::read(photo, &options, parser, generator.output_resolution() as u32)?;
-        if let Some(seconds) = subject.parser_seconds {
-            console.note(format_args!("{}: regions parsed in {seconds:.1} s", photo.display()));
+        let side = tools.generator.output_resolution() as u32;
+        let mut subjects = Vec::with_capacity(photos.len());
+        for photo in photos {
+            match Subject::read(photo, &options, tools.parser, side) {
+                Ok(subject) => {
+                    if let Some(seconds) = subject.parser_seconds {
+                        console.note(format_args!("{}: regions parsed in {seconds:.1} s", photo.display()));
+                    }
+                    subjects.push((photo.as_path(), subject));
+                }
+                Err(error) => self.fail(photo, &error.into(), report, console),
+            }
         }
+        subjects
+    }
+
+    fn fail(&self, photo: &Path, error: &anyhow::Error, report: &mut Report, console: &Console) {
+        if self.photos.len() > 1 {
+            console.error(error);
+        }
+        report.failed.push(Failed { input: photo.to_owned(), error: format!("{error:#}") });
+    }
+
+    /// Inverts photos of one person and writes their portraits.
+    fn invert(
+        &self,
+        photos: Vec<(&Path, Subject)>,
+        tools: &Tools<'_>,
+        report: &mut Report,
+        console: &Console,
+    ) -> anyhow::Result<()> {
+        let Tools { generator, perceptual, .. } = *tools;
+        let (paths, subjects): (Vec<&Path>, Vec<Subject>) = photos.into_iter().unzip();
+        let Some(first) = paths.first() else { return Ok(()) };
+        let began = std::time::Instant::now();
         let model_name = self.model.model.as_deref().unwrap_or("portrait");
-        let mut inverter = Inverter::new(generator, model_name, subject, self.config.clone(), perceptual)?;
+        let mut inverter = Inverter::of_person(generator, model_name, subjects, self.config.clone(), perceptual)?;
         let mut bar = console.bar(0, "pivot");
         let mut tuning = false;
-        while let Some(event) = inverter.step().with_context(|| photo.display().to_string())? {
+        while let Some(event) = inverter.step().with_context(|| first.display().to_string())? {
             match event {
                 Event::Pivot(step) | Event::Tune(step) => {
                     if !tuning && matches!(event, Event::Tune(_)) {
@@ -186,28 +222,32 @@ impl InvertArguments {
                 Event::Warning(text) => bar.suspend(|| console.warn(text)),
             }
         }
-        let Inversion { portrait, panels } = inverter.finish()?;
+        let inversions = inverter.finish_all()?;
         bar.finish_and_clear();
-        let output = self.output(photo);
-        let [left, right] = panels.novel;
-        let strip = [panels.photo, panels.pivot, panels.tuned, panels.regions, panels.depth, left, right];
-        portrait.save(&output)?;
-        picture::write(&output.with_extension("png"), &side_by_side(&strip))?;
-        let (metrics, camera) = (portrait.metrics, portrait.camera);
-        Ok(Inverted {
-            input: photo.to_owned(),
-            output,
-            seconds: began.elapsed().as_secs_f64(),
-            psnr: metrics.psnr,
-            ms_ssim: metrics.ms_ssim,
-            lpips: metrics.lpips,
-            mask_miou: metrics.mask_miou,
-            azimuth: camera.azimuth_rad,
-            elevation: camera.elevation_rad,
-            depth_drift: metrics.depth_drift,
-            steps_pivot: metrics.steps_pivot,
-            steps_tune: metrics.steps_tune,
-        })
+        for (photo, Inversion { portrait, panels }) in paths.into_iter().zip(inversions) {
+            let output = self.output(photo);
+            let [left, right] = panels.novel;
+            let strip = [panels.photo, panels.pivot, panels.tuned, panels.regions, panels.depth, left, right];
+            portrait.save(&output)?;
+            picture::write(&output.with_extension("png"), &side_by_side(&strip))?;
+            let (metrics, camera, seconds) = (portrait.metrics, portrait.camera, began.elapsed().as_secs_f64());
+            console.note(format_args!("{}: {:.1} dB in {seconds:.0} s", output.display(), metrics.psnr));
+            report.portraits.push(Inverted {
+                input: photo.to_owned(),
+                output,
+                seconds,
+                psnr: metrics.psnr,
+                ms_ssim: metrics.ms_ssim,
+                lpips: metrics.lpips,
+                mask_miou: metrics.mask_miou,
+                azimuth: camera.azimuth_rad,
+                elevation: camera.elevation_rad,
+                depth_drift: metrics.depth_drift,
+                steps_pivot: metrics.steps_pivot,
+                steps_tune: metrics.steps_tune,
+            });
+        }
+        Ok(())
     }
 }
 

@@ -44,7 +44,8 @@ impl FromStr for Colour {
         let digits = text.strip_prefix('#').unwrap_or(text);
         let sound = digits.len() == 6 && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
         let value = u32::from_str_radix(digits, 16).ok().filter(|_| sound);
-        let value = value.ok_or_else(|| Error::config("colour", format!("`{text}` is no colour; write one as #7a3b12")))?;
+        let value =
+            value.ok_or_else(|| Error::config("colour", format!("`{text}` is no colour; write one as #7a3b12")))?;
         Ok(Self([(value >> 16) as u8, (value >> 8) as u8, value as u8]))
     }
 }
@@ -125,8 +126,7 @@ pub fn codes(opened: &Opened, camera: &Camera, region: Region, colour: Colour) -
     let view = Camera::parameter_tensor(&[*camera], &device)?;
     let sampling = opened.generator.render_settings().sampling;
     let space = CodeSpace::measure(&opened.generator)?;
-    let mut search =
-        Displacement::new(&opened.codes, space, region.into(), Aspect::Texture, ROUNDS * STEPS, RATE)?;
+    let mut search = Displacement::new(&opened.codes, space, region.into(), Aspect::Texture, ROUNDS * STEPS, RATE)?;
     let mut aim = wanted;
     for round in 0..ROUNDS {
         let target = Tensor::new(&aim.map(|value| value as f32), &device)?.reshape((1, 3, 1))?;

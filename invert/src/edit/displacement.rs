@@ -51,8 +51,7 @@ impl Displacement {
         let places = Tensor::from_vec(places, (2 * REGION_COUNT, count), base.device())?;
         let rows = Var::zeros((count, space.style_dim()), DType::F32, base.device())?;
         let variables = vec![("displacement".to_owned(), rows.clone())];
-        let optimiser =
-            Adam::new(vec![Group { variables, learning_rate: rate, largest_gradient_norm: None }], BETAS);
+        let optimiser = Adam::new(vec![Group { variables, learning_rate: rate, largest_gradient_norm: None }], BETAS);
         Ok(Self { base: base.detach(), places, rows, space, optimiser, step: 0, steps })
     }
 

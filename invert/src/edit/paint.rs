@@ -73,9 +73,9 @@ pub fn read_map(path: &Path) -> Result<LabelMap> {
 }
 
 fn region_of(colour: [u8; 3]) -> Option<Region> {
-    Region::ALL.into_iter().find(|region| {
-        region.colour().iter().zip(colour).all(|(own, found)| own.abs_diff(found) <= COLOUR_TOLERANCE)
-    })
+    Region::ALL
+        .into_iter()
+        .find(|region| region.colour().iter().zip(colour).all(|(own, found)| own.abs_diff(found) <= COLOUR_TOLERANCE))
 }
 
 /// The regions that `painted` gives another extent than `shown` (of the same size), without the background: it is
@@ -112,7 +112,11 @@ pub fn codes(opened: &Opened, camera: &Camera, painted: &LabelMap, regions: Regi
         return Err(Error::config("--mask-paint", "the map is the portrait's own; repaint some of it"));
     }
     let shape = (1, REGION_COUNT, resolution, resolution);
-    let kept = Tensor::from_vec(differs.iter().map(|differs| 1.0 - differs).collect(), (1, 1, resolution, resolution), &device)?;
+    let kept = Tensor::from_vec(
+        differs.iter().map(|differs| 1.0 - differs).collect(),
+        (1, 1, resolution, resolution),
+        &device,
+    )?;
     let level = Level {
         resolution,
         colour: picture.frame.colour.detach(),
@@ -140,7 +144,8 @@ pub fn codes(opened: &Opened, camera: &Camera, painted: &LabelMap, regions: Regi
 /// Half the rays where the map changed, half anywhere; u32 indices.
 fn draw(resolution: usize, focus: &[u32], random: &mut Stream, device: &candle_core::Device) -> Result<Tensor> {
     let anywhere: Vec<u32> = objective::draw_pixels(resolution, RAYS / 2, random, device)?.to_vec1()?;
-    let there = random.permutation(focus.len()).into_iter().take(RAYS / 2).filter_map(|index| focus.get(index).copied());
+    let there =
+        random.permutation(focus.len()).into_iter().take(RAYS / 2).filter_map(|index| focus.get(index).copied());
     let chosen: Vec<u32> = there.chain(anywhere).collect();
     let length = chosen.len();
     Ok(Tensor::from_vec(chosen, length, device)?.to_dtype(DType::U32)?)

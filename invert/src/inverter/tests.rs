@@ -236,8 +236,7 @@ fn a_painted_map_draws_the_shapes_towards_it() {
     let codes = generator.codes_from_seed(5, 1.0).unwrap();
     let codes = cnerf_core::codes::blend(&opened.codes, &codes, cnerf_core::region::RegionSet::ALL, Aspect::Shape, 1.0);
     let other = Opened { codes: codes.unwrap(), ..opened };
-    let painted =
-        LabelMap::from_masks(&other.picture(&portrait.camera).unwrap().masks.squeeze(0).unwrap()).unwrap();
+    let painted = LabelMap::from_masks(&other.picture(&portrait.camera).unwrap().masks.squeeze(0).unwrap()).unwrap();
     let off = |map: &LabelMap| map.labels().iter().zip(painted.labels()).filter(|(a, b)| a != b).count();
     let before = off(&own);
     assert!(before > 60, "the test needs maps that differ: {before} of 1024 pixels");
@@ -281,4 +280,30 @@ fn directions_are_a_regions_own_strongest_first() {
     let apart = (eyes.get(0).unwrap() - hair.get(0).unwrap()).unwrap().abs().unwrap().max_all().unwrap();
     assert!(apart.to_scalar::<f32>().unwrap() > 1e-3, "each region has its own");
     assert!(edit::directions(&generator, Region::Eyes.into(), Aspect::Shape, 17).is_err());
+}
+
+#[test]
+fn photos_of_one_person_share_everything_but_the_camera() {
+    let generator = small_generator(3);
+    let two = vec![
+        subject(&generator, true),
+        Subject {
+            aligned: Aligned { camera: Camera::at(-0.2, 0.1), ..subject(&generator, true).aligned },
+            ..subject(&generator, true)
+        },
+    ];
+    let mut inverter = Inverter::of_person(&generator, "small", two, config(), None).unwrap();
+    let mut losses = Vec::new();
+    while let Some(event) = inverter.step().unwrap() {
+        if let Event::Pivot(report) = event {
+            losses.push(report.loss);
+        }
+    }
+    let ends = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
+    assert!(ends(&losses[losses.len() - 8..]) < ends(&losses[..8]), "{losses:?}");
+    let both = inverter.finish_all().unwrap();
+    let codes = |index: usize| both[index].portrait.codes.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!((both.len(), codes(0)), (2, codes(1)));
+    assert_ne!(both[0].portrait.camera, both[1].portrait.camera);
+    assert!(Inverter::of_person(&generator, "small", Vec::new(), config(), None).is_err());
 }

@@ -16,11 +16,7 @@ use cnerf_core::data::{
 };
 use image::{GrayImage, Luma, RgbImage};
 use tract_onnx::{
-    onnx,
-    pb::GraphProto,
-    prelude::*,
-    tract_core::internal::DimLike as _,
-    tract_hir::infer::Factoid as _,
+    onnx, pb::GraphProto, prelude::*, tract_core::internal::DimLike as _, tract_hir::infer::Factoid as _,
 };
 
 use super::{PixelScale, RegionParser};
@@ -78,7 +74,8 @@ impl OnnxParser {
         let (network, input) = contained(|| network(&bytes)).map_err(refuse)?;
         let fact = contained(|| network.model().output_fact(0).cloned().map_err(one_line)).map_err(refuse)?;
         let shape = fact.shape.as_concrete().map(<[usize]>::to_vec);
-        let shape = shape.ok_or_else(|| refuse("the size of its output is not fixed; export it with fixed sizes".into()))?;
+        let shape =
+            shape.ok_or_else(|| refuse("the size of its output is not fixed; export it with fixed sizes".into()))?;
         let output = Output::of(&shape, fact.datum_type, scheme.len(), input.channels_last).map_err(refuse)?;
         Ok(Self { path: path.to_owned(), network, scheme, scale, input, output })
     }
@@ -101,10 +98,12 @@ impl OnnxParser {
         };
         let mut values = Vec::with_capacity(3 * width * height);
         if channels_last {
-            (0..height).for_each(|y| (0..width).for_each(|x| values.extend((0..3).map(|channel| value(channel, x, y)))));
+            (0..height)
+                .for_each(|y| (0..width).for_each(|x| values.extend((0..3).map(|channel| value(channel, x, y)))));
             Tensor::from_shape(&[1, height, width, 3], &values)
         } else {
-            (0..3).for_each(|channel| (0..height).for_each(|y| values.extend((0..width).map(|x| value(channel, x, y)))));
+            (0..3)
+                .for_each(|channel| (0..height).for_each(|y| values.extend((0..width).map(|x| value(channel, x, y)))));
             Tensor::from_shape(&[1, 3, height, width], &values)
         }
     }
@@ -126,9 +125,14 @@ impl OnnxParser {
                     let index = if first { class * width * height + pixel } else { pixel * classes + class };
                     scores.get(index).copied().unwrap_or(f32::NEG_INFINITY)
                 };
-                let best = |pixel: usize| (1..classes).fold(0, |best, class| {
-                    if score(pixel, class) > score(pixel, best) { class } else { best }
-                });
+                let best = |pixel: usize| {
+                    (1..classes).fold(
+                        0,
+                        |best, class| {
+                            if score(pixel, class) > score(pixel, best) { class } else { best }
+                        },
+                    )
+                };
                 Ok((0..width * height).map(|pixel| best(pixel) as i64).collect())
             }
         }
@@ -152,7 +156,10 @@ impl RegionParser for OnnxParser {
         let labels = labels.map_err(refuse)?;
         let (width, height) = self.output.size();
         if labels.len() != width * height {
-            return Err(refuse(format!("gave {} labels for {width}x{height} pixels; give another parser", labels.len())));
+            return Err(refuse(format!(
+                "gave {} labels for {width}x{height} pixels; give another parser",
+                labels.len()
+            )));
         }
         let mut map = GrayImage::new(side as u32, side as u32);
         for (x, y, pixel) in map.enumerate_pixels_mut() {
@@ -172,12 +179,7 @@ impl RegionParser for OnnxParser {
 
 impl Output {
     /// What an output of this shape and type is, if a parser of `classes` classes can give it.
-    fn of(
-        shape: &[usize],
-        datum: DatumType,
-        classes: usize,
-        channels_last: bool,
-    ) -> std::result::Result<Self, String> {
+    fn of(shape: &[usize], datum: DatumType, classes: usize, channels_last: bool) -> std::result::Result<Self, String> {
         let sound = |width: usize, height: usize| (1..=2048).contains(&width) && (1..=2048).contains(&height);
         let found = match *shape {
             [1, height, width] | [1, 1, height, width] | [1, height, width, 1] | [height, width]
@@ -186,10 +188,16 @@ impl Output {
                 Some(Self::Labels { width, height })
             }
             [1, first, second, third] if datum.is_float() => {
-                let leading = (first == classes && sound(third, second))
-                    .then_some(Self::ScoresFirst { width: third, height: second, classes });
-                let trailing = (third == classes && sound(second, first))
-                    .then_some(Self::ScoresLast { width: second, height: first, classes });
+                let leading = (first == classes && sound(third, second)).then_some(Self::ScoresFirst {
+                    width: third,
+                    height: second,
+                    classes,
+                });
+                let trailing = (third == classes && sound(second, first)).then_some(Self::ScoresLast {
+                    width: second,
+                    height: first,
+                    classes,
+                });
                 if channels_last { trailing.or(leading) } else { leading.or(trailing) }
             }
             _ => None,
@@ -214,9 +222,9 @@ impl Output {
 /// Reads and prepares a network of one picture in, and says how it wants the picture.
 fn network(bytes: &[u8]) -> std::result::Result<(Network, Input), String> {
     let onnx = onnx();
-    let proto = onnx.proto_model_for_read(&mut Cursor::new(bytes)).map_err(|error| {
-        format!("is no ONNX file ({}); give a face parser exported to ONNX", one_line(error))
-    })?;
+    let proto = onnx
+        .proto_model_for_read(&mut Cursor::new(bytes))
+        .map_err(|error| format!("is no ONNX file ({}); give a face parser exported to ONNX", one_line(error)))?;
     let graph = proto.graph.as_ref().ok_or("holds no network; give a face parser exported to ONNX")?;
     check_operators(graph)?;
     let unusable = |error: TractError| format!("cannot be run as a face parser ({})", one_line(error));
@@ -252,9 +260,10 @@ fn network(bytes: &[u8]) -> std::result::Result<(Network, Input), String> {
     model.set_input_fact(0, f32::fact(shape).into()).map_err(unusable)?;
     let typed = model.into_typed().map_err(unusable)?;
     for fact in typed.nodes().iter().flat_map(|node| &node.outputs).map(|outlet| &outlet.fact) {
-        let values = fact.shape.as_concrete().and_then(|shape| {
-            shape.iter().try_fold(1usize, |values, length| values.checked_mul(*length))
-        });
+        let values = fact
+            .shape
+            .as_concrete()
+            .and_then(|shape| shape.iter().try_fold(1usize, |values, length| values.checked_mul(*length)));
         if values.is_none_or(|values| values > MOST_VALUES) {
             return Err("has tensors of unknown or unreasonable size; export it with fixed sizes".into());
         }

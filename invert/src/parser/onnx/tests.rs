@@ -51,10 +51,14 @@ fn identity(input: &[u64], labels: bool) -> Vec<u8> {
     let weights = [dims, number(2, FLOAT), bytes(8, b"w"), bytes(9, &weights)].concat();
     let mut graph = bytes(1, &node("Conv", &["x", "w"], "scores", &[]));
     if labels {
-        graph.extend(bytes(1, &node("ArgMax", &["scores"], "labels", &[attribute("axis", 1), attribute("keepdims", 0)])));
+        graph.extend(bytes(
+            1,
+            &node("ArgMax", &["scores"], "labels", &[attribute("axis", 1), attribute("keepdims", 0)]),
+        ));
     }
     graph.extend([bytes(2, b"parser"), bytes(5, &weights), bytes(11, &value_info("x", FLOAT, input))].concat());
-    let output = if labels { value_info("labels", INT64, &[1, 16, 24]) } else { value_info("scores", FLOAT, &[1, 3, 16, 24]) };
+    let output =
+        if labels { value_info("labels", INT64, &[1, 16, 24]) } else { value_info("scores", FLOAT, &[1, 3, 16, 24]) };
     graph.extend(bytes(12, &output));
     [number(1, 8), bytes(7, &graph), bytes(8, &[bytes(1, b""), number(2, 13)].concat())].concat()
 }
