@@ -13,9 +13,10 @@ use candle_core::{DType, Device, Tensor, Var, backprop::GradStore};
 use cnerf_core::{
     codes,
     interop::{
+        authors::permute_regions,
         authors_nets::{
-            discriminator_config, discriminator_tensors, discriminator_weights, reorder_regions, upsampler_config,
-            upsampler_tensors, upsampler_weights,
+            discriminator_config, discriminator_tensors, discriminator_weights, upsampler_config, upsampler_tensors,
+            upsampler_weights,
         },
         torch::read_checkpoint,
     },
@@ -67,7 +68,7 @@ impl Reference {
 
     /// Masks or classes along `dimension`, in our order.
     fn regions(&self, name: &str, dimension: usize) -> Tensor {
-        reorder_regions(&self.get(name), dimension).unwrap()
+        permute_regions(&self.get(name), dimension).unwrap()
     }
 
     /// The float64 tensor if there is one.
@@ -87,7 +88,7 @@ impl Reference {
     }
 
     fn check_regions(&self, name: &str, found: &Tensor, dimension: usize, tolerance: f64) {
-        self.compare(name, found, &reorder_regions(&self.truth(name), dimension).unwrap(), tolerance);
+        self.compare(name, found, &permute_regions(&self.truth(name), dimension).unwrap(), tolerance);
     }
 
     fn compare(&self, name: &str, found: &Tensor, expected: &Tensor, tolerance: f64) {
@@ -356,7 +357,7 @@ fn parity_of_the_high_resolution_discriminator() {
         let (network, _) = discriminator(reference, kind);
         let (image, masks) = (reference.truth("plain/rgb"), reference.truth("plain/seg_high"));
         let single = |tensor: &Tensor| tensor.to_dtype(DType::F32).unwrap();
-        let masks = reorder_regions(&masks, 1).unwrap();
+        let masks = permute_regions(&masks, 1).unwrap();
         let pictures = Pictures { image: &single(&image), masks: &single(&masks) };
         reference.check("g2/loss", &generator_terms(&network, pictures, Auxiliary::None).unwrap().total, VALUES);
     });

@@ -31,8 +31,7 @@ fn refused(folder: &Folder, line: &str, said: &[&str]) -> String {
     run.stderr
 }
 
-/// As [`refused`], and the error is one line. (Mistakes in options are the argument parser's, which adds a hint and the
-/// usage below its line.)
+/// As [`refused`], and the error is one line.
 fn refused_in_a_line(folder: &Folder, line: &str, said: &[&str]) {
     let error = refused(folder, line, said);
     assert_eq!(error.lines().count(), 1, "`cnerf {line}`: {error}");
@@ -62,16 +61,16 @@ fn folder_with_portrait(name: &str) -> Folder {
 #[test]
 fn a_typo_in_an_option_names_the_option_meant() {
     let folder = Folder::new("typo");
-    refused(&folder, "generate --sedes 1 --out random", &["--sedes", "--seeds"]);
-    refused(&folder, "generat --out random", &["generat", "generate"]);
-    refused(&folder, "synth --count many --out data", &["many", "--count"]);
+    refused_in_a_line(&folder, "generate --sedes 1 --out random", &["--sedes", "--seeds"]);
+    refused_in_a_line(&folder, "generat --out random", &["generat", "generate"]);
+    refused_in_a_line(&folder, "synth --count many --out data", &["many", "--count"]);
 }
 
 #[test]
 fn an_unknown_region_lists_the_regions() {
     let folder = Folder::new("region");
     let line = "edit portrait.cnerf --region hair,eyez --seed 1 --out edited.cnerf";
-    refused(&folder, line, &["--region", "`eyez`", "eyes", "hair", "skin"]);
+    refused_in_a_line(&folder, line, &["--region", "`eyez`", "eyes", "hair", "skin"]);
 }
 
 #[test]
@@ -86,7 +85,7 @@ fn a_typo_in_a_setting_lists_the_settings_there_are() {
 #[test]
 fn a_missing_file_is_named() {
     let folder = Folder::with_model("missing");
-    refused_in_a_line(&folder, "edit nobody.cnerf --region hair --seed 1 --out edited.cnerf", &["nobody.cnerf"]);
+    refused_in_a_line(&folder, "edit nobody.cnerf --region hair --seed 1 --out edited.cnerf", &["nobody.cnerf: no such file", "check its name"]);
     refused_in_a_line(&folder, "train --data nowhere --preset tiny --out run", &["nowhere"]);
     refused_in_a_line(
         &folder,
@@ -94,7 +93,7 @@ fn a_missing_file_is_named() {
         &["nothing.safetensors", "portrait"],
     );
     refused_in_a_line(&folder, "info nothing", &["nothing"]);
-    refused_in_a_line(&folder, &format!("invert nobody.png --model {MODEL} --out out"), &["nobody.png"]);
+    refused_in_a_line(&folder, &format!("invert nobody.png --model {MODEL} --out out"), &["nobody.png: no such file"]);
 }
 
 #[test]

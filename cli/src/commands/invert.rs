@@ -121,7 +121,7 @@ impl InvertArguments {
         }
         let mut report = Report::default();
         let groups: Vec<&[PathBuf]> =
-            if self.same_person { vec![&self.photos] } else { self.photos.chunks(1).collect() };
+            if self.same_person { vec![self.photos.as_slice()] } else { self.photos.chunks(1).collect() };
         for photos in groups {
             let failed = report.failed.len();
             let subjects = self.read(photos, &tools, &mut report, console);

@@ -17,10 +17,8 @@ use image::{
 };
 pub use image::{GrayImage, RgbImage};
 
-use crate::{
-    error::{Error, Result},
-    files::write_atomically,
-};
+use crate::error::{Error, Result};
+pub use crate::files::write_atomically as write_file;
 
 /// Largest width and height of a picture that is read, pixels.
 pub const MAX_SIDE: u32 = 8192;
@@ -227,7 +225,7 @@ pub fn write(path: &Path, picture: &RgbImage) -> Result<()> {
         "jpg" | "jpeg" => encode_jpeg(picture, 95)?,
         _ => return Err(Error::malformed(path, "pictures are written as .png or .jpg; name the file so")),
     };
-    write_atomically(path, &bytes)
+    write_file(path, &bytes)
 }
 
 /// Pictures of one size as a tensor `[B, 3, H, W]`, f32 in [-1, 1].
