@@ -160,7 +160,11 @@ fn a_page_turns_the_head_and_hides_regions() {
         .unwrap();
     let _ = fs::remove_dir_all(folder.path("browser"));
     let text = String::from_utf8_lossy(&output.stdout);
-    let seen = text.rsplit("<pre id=\"seen\">").next().filter(|_| text.contains("data-ready")).and_then(|rest| rest.split("</pre>").next());
+    let seen = text
+        .rsplit("<pre id=\"seen\">")
+        .next()
+        .filter(|_| text.contains("data-ready"))
+        .and_then(|rest| rest.split("</pre>").next());
     let seen = seen.unwrap_or_else(|| panic!("the page never got ready: {}", String::from_utf8_lossy(&output.stderr)));
     let seen: serde_json::Value = serde_json::from_str(seen).unwrap_or_else(|_| panic!("{seen}"));
     let sum = |name: &str| number(&seen[name], "sum");

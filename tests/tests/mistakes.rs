@@ -85,7 +85,11 @@ fn a_typo_in_a_setting_lists_the_settings_there_are() {
 #[test]
 fn a_missing_file_is_named() {
     let folder = Folder::with_model("missing");
-    refused_in_a_line(&folder, "edit nobody.cnerf --region hair --seed 1 --out edited.cnerf", &["nobody.cnerf: no such file", "check its name"]);
+    refused_in_a_line(
+        &folder,
+        "edit nobody.cnerf --region hair --seed 1 --out edited.cnerf",
+        &["nobody.cnerf: no such file", "check its name"],
+    );
     refused_in_a_line(&folder, "train --data nowhere --preset tiny --out run", &["nowhere"]);
     refused_in_a_line(
         &folder,

@@ -113,18 +113,17 @@ impl InvertArguments {
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
         let parser = self.parser.load()?;
         let tools = Tools { generator: &generator, perceptual: perceptual.as_ref(), parser: parser.as_deref() };
-        if !console.is_quiet() {
-            let seconds = estimate_seconds(&generator, &self.config, tools.perceptual)?;
-            let (effort, count) = (self.config.effort.name(), self.photos.len());
-            let photos = if count == 1 { "the photo".to_owned() } else { format!("each of {count} photos") };
-            console.note(format_args!("{effort} effort: about {} for {photos}", duration(seconds)));
-        }
         let mut report = Report::default();
         let groups: Vec<&[PathBuf]> =
             if self.same_person { vec![self.photos.as_slice()] } else { self.photos.chunks(1).collect() };
+        let mut told = console.is_quiet();
         for photos in groups {
             let failed = report.failed.len();
             let subjects = self.read(photos, &tools, &mut report, console);
+            if !told && !subjects.is_empty() {
+                told = true;
+                self.tell_time(&tools, console)?;
+            }
             if let Err(error) = self.invert(subjects, &tools, &mut report, console) {
                 let unread = report.failed.iter().skip(failed).map(|one| one.input.clone()).collect::<Vec<_>>();
                 for photo in photos.iter().filter(|photo| !unread.contains(photo)) {
@@ -152,6 +151,19 @@ impl InvertArguments {
             lines.collect::<Vec<_>>().join("\n")
         })?;
         Ok(if partial { Outcome::Partial } else { Outcome::Done })
+    }
+
+    /// Says how long it will take, before it does.
+    fn tell_time(&self, tools: &Tools<'_>, console: &Console) -> anyhow::Result<()> {
+        let seconds = estimate_seconds(tools.generator, &self.config, tools.perceptual)?;
+        let (effort, count) = (self.config.effort.name(), self.photos.len());
+        let photos = match (count, self.same_person) {
+            (1, _) => "the photo".to_owned(),
+            (_, true) => "all photos together".to_owned(),
+            (_, false) => format!("each of {count} photos"),
+        };
+        console.note(format_args!("{effort} effort: about {} for {photos}", duration(seconds)));
+        Ok(())
     }
 
     fn output(&self, photo: &Path) -> PathBuf {
