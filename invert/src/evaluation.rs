@@ -213,7 +213,8 @@ impl People {
         if options.known_masks && known.is_none() {
             return Err(Error::config("--known-masks", format!("{name}: the data set has no mask of it")));
         }
-        let subject = Subject { source: name.clone(), aligned, labels: known, warnings: Vec::new() };
+        let subject =
+            Subject { source: name.clone(), aligned, labels: known, parser_seconds: None, warnings: Vec::new() };
         let other = |index: &usize| -> Result<Option<OtherView>> {
             let Item { image, mask, camera } = dataset.item(*index)?;
             let Some(camera) = camera else { return Ok(None) };

@@ -19,10 +19,7 @@ use crate::{
     error::{Error, Result},
     eval::perceptual::Perceptual,
     files,
-    model::{
-        file::{self, Tensors},
-        generator::Generator,
-    },
+    model::{file::Tensors, generator::Generator},
     train::{
         checkpoint::{CheckpointHeader, Checkpoints},
         config::{Stage, TrainConfig},
