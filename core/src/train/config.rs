@@ -198,6 +198,9 @@ pub struct UpsamplerStageConfig {
     pub pixels: f64,
     /// Weight of LPIPS against it (needs `--lpips`).
     pub perceptual: f64,
+    /// LPIPS sees crops enlarged by a factor drawn from 1 to this. At one fixed scale AlexNet's stride of 4 cannot tell
+    /// hair from hatching of that period, and the upsampler learns to hatch.
+    pub perceptual_zoom: f64,
     /// Weight of the non-saturating adversarial loss.
     pub adversarial: f64,
     /// Channels of the discriminator relative to the authors' tables.
@@ -288,7 +291,8 @@ impl TrainConfig {
                 schedule: Schedule { warmup_steps: 50, hold: 0.4, floor: 0.05 },
                 betas: [0.9, 0.99],
                 pixels: 1.0,
-                perceptual: 1.0,
+                perceptual: 0.5,
+                perceptual_zoom: 2.0,
                 adversarial: 0.0,
                 channel_multiplier: 0.125,
                 average_half_life_images: 1_000.0,
@@ -346,6 +350,7 @@ impl TrainConfig {
             betas: [0.0, 0.99],
             pixels: 0.0,
             perceptual: 0.0,
+            perceptual_zoom: 1.0,
             adversarial: 1.0,
             channel_multiplier: 1.0,
             r1_image: 10.0,
@@ -408,6 +413,9 @@ impl TrainConfig {
         positive("field.samples", self.field.samples)?;
         positive("upsampler.batch", self.upsampler.batch)?;
         positive("upsampler.crop", self.upsampler.crop)?;
+        if !(1.0..=4.0).contains(&self.upsampler.perceptual_zoom) {
+            return Err(Error::config("upsampler.perceptual_zoom", "must be between 1 and 4"));
+        }
         positive("checkpoint_steps", self.checkpoint_steps)?;
         positive("sample_steps", self.sample_steps)?;
         positive("log_steps", self.log_steps)?;

@@ -194,9 +194,14 @@ impl UpsamplerStage {
         if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0) {
             let [x, y] = [random.below(LARGEST_SHIFT + 1), random.below(LARGEST_SHIFT + 1)];
             let side = crop * factor;
-            let shifted =
-                |t: &Tensor| t.narrow(2, y, side - LARGEST_SHIFT)?.narrow(3, x, side - LARGEST_SHIFT)?.contiguous();
-            let distance = perceptual.distance(&shifted(&output.rgb)?, &shifted(&target)?)?.mean_all()?;
+            let side = side - LARGEST_SHIFT;
+            let zoom = f64::from(random.range(1.0, config.perceptual_zoom as f32));
+            let enlarged = enlargement(side, (side as f64 * zoom).round() as usize, &self.device)?;
+            let view = |picture: &Tensor| -> Result<Tensor> {
+                let crop = picture.narrow(2, y, side)?.narrow(3, x, side)?.contiguous()?;
+                Ok(enlarged.broadcast_matmul(&crop)?.broadcast_matmul(&enlarged.t()?)?)
+            };
+            let distance = perceptual.distance(&view(&output.rgb)?, &view(&target)?)?.mean_all()?;
             metrics.push("perceptual", scalar(&distance)?);
             total = (total + (distance * config.perceptual)?)?;
         }
@@ -418,6 +423,20 @@ impl StageRun for UpsamplerStage {
     }
 }
 
+/// Bilinear enlargement of a line of `source` pixels to `target` as a matrix `[target, source]`, pixel centres aligned
+/// as areas are, edges repeated: a product, so that candle differentiates it.
+fn enlargement(source: usize, target: usize, device: &Device) -> Result<Tensor> {
+    let mut weights = vec![0f32; target * source];
+    for (row, weights) in weights.chunks_exact_mut(source.max(1)).enumerate() {
+        let position = (row as f64 + 0.5) * source as f64 / target as f64 - 0.5;
+        let position = position.clamp(0.0, (source - 1) as f64);
+        let (left, share) = (position as usize, position.fract() as f32);
+        weights[left] += 1.0 - share;
+        weights[(left + 1).min(source - 1)] += share;
+    }
+    Ok(Tensor::from_vec(weights, (target, source), device)?)
+}
+
 fn scalar(loss: &Tensor) -> Result<f64> {
     Ok(f64::from(loss.to_dtype(DType::F32)?.to_scalar::<f32>()?))
 }
@@ -426,5 +445,23 @@ fn finite(metrics: &Metrics) -> Result<()> {
     match metrics.first_not_finite() {
         Some(quantity) => Err(Error::not_finite(format!("loss term {quantity}"))),
         None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn enlargement_keeps_ramps_and_is_the_identity_at_one() {
+        let ramp = Tensor::arange(0f32, 8.0, &Device::Cpu).unwrap().reshape((8, 1)).unwrap();
+        let at = |target| enlargement(8, target, &Device::Cpu).unwrap().matmul(&ramp).unwrap();
+        let values = |tensor: Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(values(at(8)), values(ramp.clone()));
+        // Between the outer pixels' centres a ramp stays one: value (row + 1/2) · 8/13 − 1/2.
+        for (row, value) in values(at(13)).into_iter().enumerate() {
+            let expected = ((row as f32 + 0.5) * 8.0 / 13.0 - 0.5).clamp(0.0, 7.0);
+            assert!((value - expected).abs() < 1e-5, "{row}: {value}, {expected}");
+        }
     }
 }
