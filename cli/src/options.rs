@@ -30,9 +30,9 @@ pub struct GlobalOptions {
     pub verbose: u8,
 }
 
-/// Where a model is used.
+/// Which model, and where it computes.
 #[derive(Args, Clone, Debug)]
-pub struct ModelOptions {
+pub struct ModelSource {
     /// The model: `portrait` and `cartoon` are built in; else a file
     #[arg(long, value_name = "NAME|PATH")]
     pub model: Option<String>,
@@ -41,7 +41,24 @@ pub struct ModelOptions {
     pub device: String,
 }
 
+/// Where a model renders.
+#[derive(Args, Clone, Debug)]
+pub struct ModelOptions {
+    #[command(flatten)]
+    source: ModelSource,
+    /// Largest allowed error per pixel of renders from leaving out what hardly shows, in [0, 1] colour units; 0 = exact
+    #[arg(long, default_value_t = 0.002, value_name = "E", value_parser = budget, allow_negative_numbers = true)]
+    budget: f64,
+}
+
 impl ModelOptions {
+    /// The model asked for, or `default`; its renders keep the budget.
+    pub fn load_or(&self, default: &str) -> anyhow::Result<Generator> {
+        Ok(self.source.load_or(default)?.with_budget(self.budget))
+    }
+}
+
+impl ModelSource {
     /// The model asked for, or `default`.
     pub fn load_or(&self, default: &str) -> anyhow::Result<Generator> {
         let name = self.model.as_deref().unwrap_or(default);
@@ -64,6 +81,13 @@ impl ModelOptions {
             None if self.device == "metal" => gpu("metal", Device::new_metal(0)),
             _ => bail!("--device {}: unknown; use cpu, cuda, cuda:N or metal", self.device),
         }
+    }
+}
+
+fn budget(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(budget) if (0.0..=1.0).contains(&budget) => Ok(budget),
+        _ => Err("must be a number between 0 (exact) and 1".into()),
     }
 }
 

@@ -9,6 +9,10 @@ use cnerf_core::{
     interop::page::PageFrame,
     model::generator::{Generator, Picture},
     region::RegionSet,
+    render::{
+        RenderSettings,
+        plan::{self, FrameReport, Sequence},
+    },
 };
 use image::{RgbImage, imageops};
 
@@ -88,32 +92,78 @@ pub struct Scene<'a> {
     pub regions: RegionSet,
 }
 
+/// What was shown, and how the render under it was made.
+pub struct Shown {
+    /// One for each view asked for.
+    pub pictures: Vec<RgbImage>,
+    /// Its bound and its cost.
+    pub report: FrameReport,
+}
+
+/// Frames from which shared geometry pays: its grid costs about as much as two exact frames.
+const FRAMES_TO_SHARE: usize = 6;
+
 impl Scene<'_> {
-    /// One picture for each of `views`, at the model's output resolution.
-    pub fn pictures(&self, camera: &Camera, views: &[View]) -> anyhow::Result<Vec<RgbImage>> {
-        let picture = self.picture(camera, views.contains(&View::Normal))?;
-        views.iter().map(|view| self.show(&picture, *view)).collect()
+    /// What renders need.
+    fn settings(&self, normals: bool) -> RenderSettings {
+        let mut settings = self.generator.render_settings();
+        settings.regions = self.regions;
+        settings.normals |= normals;
+        settings
+    }
+
+    /// Geometry shared by renders from all `cameras`, if there are enough of them; `normals`: whether they show any.
+    pub fn sequence(&self, cameras: &[Camera], normals: bool) -> anyhow::Result<Option<Sequence>> {
+        if cameras.len() < FRAMES_TO_SHARE {
+            return Ok(None);
+        }
+        let cameras = Camera::parameter_tensor(cameras, &self.generator.device())?;
+        let field = self.generator.field().portraits(self.codes)?;
+        Ok(Some(Sequence::new(&field, &cameras, &self.settings(normals))?))
+    }
+
+    /// One picture for each of `views`, at the model's output resolution; over the geometry of `sequence`, if any.
+    pub fn pictures(&self, camera: &Camera, views: &[View], sequence: Option<&Sequence>) -> anyhow::Result<Shown> {
+        let (picture, report) = self.picture(camera, views.contains(&View::Normal), sequence)?;
+        let pictures = views.iter().map(|view| self.show(&picture, *view)).collect::<anyhow::Result<_>>()?;
+        Ok(Shown { pictures, report })
     }
 
     /// All that a page shows of one view.
-    pub fn page_frame(&self, camera: &Camera) -> anyhow::Result<PageFrame> {
-        let picture = self.picture(camera, true)?;
-        Ok(PageFrame {
+    pub fn page_frame(&self, camera: &Camera, sequence: Option<&Sequence>) -> anyhow::Result<(PageFrame, FrameReport)> {
+        let (picture, report) = self.picture(camera, true, sequence)?;
+        let frame = PageFrame {
             portrait: self.show(&picture, View::Rgb)?,
             depth: self.show(&picture, View::Depth)?,
             normal: self.show(&picture, View::Normal)?,
             labels: LabelMap::from_masks(&picture.masks.squeeze(0)?)?,
-        })
+        };
+        Ok((frame, report))
     }
 
-    fn picture(&self, camera: &Camera, normals: bool) -> anyhow::Result<Picture> {
-        let mut settings = self.generator.render_settings();
-        settings.regions = self.regions;
-        settings.normals |= normals;
+    fn picture(
+        &self,
+        camera: &Camera,
+        normals: bool,
+        sequence: Option<&Sequence>,
+    ) -> anyhow::Result<(Picture, FrameReport)> {
         let cameras = Camera::parameter_tensor(&[*camera], &self.generator.device())?;
-        let frame = self.generator.render(self.codes, &cameras, &settings)?;
+        let field = self.generator.field().portraits(self.codes)?;
+        let planned = match sequence {
+            Some(sequence) => sequence.render(&field, &cameras)?,
+            None => plan::render(&field, &cameras, &self.settings(normals))?,
+        };
+        let plan::Planned { frame, report } = planned;
+        tracing::info!(
+            method = ?report.method,
+            bound = report.bound,
+            shapes = report.shape_pairs_evaluated,
+            textures = report.pairs_evaluated,
+            skipped = report.pairs_skipped,
+            "rendered"
+        );
         let lifted = self.generator.upsample(&frame, self.codes, self.global)?;
-        Ok(Picture { rgb: lifted.rgb, masks: lifted.masks, frame })
+        Ok((Picture { rgb: lifted.rgb, masks: lifted.masks, frame }, report))
     }
 
     fn show(&self, picture: &Picture, view: View) -> anyhow::Result<RgbImage> {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use cnerf_core::{camera::Camera, data::picture, interop::sheet::Sheet, region::RegionSet};
+use cnerf_core::{camera::Camera, data::picture, interop::sheet::Sheet, region::RegionSet, render::plan::FrameReport};
 use serde::Serialize;
 
 use crate::{
@@ -47,6 +47,8 @@ struct Report {
     files: Vec<PathBuf>,
     grid: PathBuf,
     seconds: f64,
+    /// Of all renders together.
+    plan: Option<FrameReport>,
 }
 
 impl GenerateArguments {
@@ -66,11 +68,14 @@ impl GenerateArguments {
         let camera = Camera::at(self.azimuth, self.elevation);
         let bar = console.bar(self.seeds.len() as u64, "generate");
         let mut files = Vec::new();
+        let mut plan: Option<FrameReport> = None;
         let mut sheet = Sheet::near_square(self.seeds.len());
         for seed in &self.seeds {
             let codes = generator.codes_from_seed(*seed, self.trunc)?;
             let scene = Scene { generator: &generator, codes: &codes, global: None, regions: self.regions };
-            for (view, shown) in self.output.iter().zip(scene.pictures(&camera, &self.output)?) {
+            let shown = scene.pictures(&camera, &self.output, None)?;
+            plan = Some(plan.map_or(shown.report, |plan| plan.and(shown.report)));
+            for (view, shown) in self.output.iter().zip(shown.pictures) {
                 let path = file(*seed, *view);
                 picture::write(&path, &shown)?;
                 files.push(path);
@@ -80,7 +85,7 @@ impl GenerateArguments {
         }
         sheet.save(&grid)?;
         bar.finish_and_clear();
-        let report = Report { files, grid, seconds: began.elapsed().as_secs_f64() };
+        let report = Report { files, grid, seconds: began.elapsed().as_secs_f64(), plan };
         console.result(&report, || {
             format!("{}: {} pictures in {:.1} s", report.grid.display(), report.files.len(), report.seconds)
         })?;

@@ -14,7 +14,10 @@ use cnerf_core::{
     },
     model::generator::Generator,
     region::RegionSet,
-    render::trajectory::Trajectory,
+    render::{
+        plan::{FrameReport, Sequence},
+        trajectory::Trajectory,
+    },
 };
 use image::RgbImage;
 use serde::Serialize;
@@ -78,6 +81,8 @@ struct Report {
     width: u32,
     height: u32,
     seconds: f64,
+    /// Of all frames together.
+    plan: Option<FrameReport>,
 }
 
 /// One end of a blend.
@@ -104,17 +109,30 @@ impl RenderArguments {
         let began = std::time::Instant::now();
         let cameras = self.trajectory.cameras(self.frames)?;
         let keys = self.keys(seed)?;
+        let sequence = match keys.as_slice() {
+            [key] => {
+                let eyes: Vec<Camera> = match self.stereo {
+                    Some(_) => cameras.iter().flat_map(Stereo::cameras).collect(),
+                    None => cameras.clone(),
+                };
+                key.scene(self.regions).sequence(&eyes, self.output.contains(&View::Normal))?
+            }
+            _ => None,
+        };
+        let mut plan: Option<FrameReport> = None;
         let bar = console.bar(cameras.len() as u64, "render");
         let mut frames = Vec::with_capacity(cameras.len());
         for (index, camera) in cameras.iter().enumerate() {
-            frames.push(self.frame(&keys, index, cameras.len(), camera)?);
+            let (frame, report) = self.frame(&keys, index, cameras.len(), camera, sequence.as_ref())?;
+            plan = Some(plan.map_or(report, |plan| plan.and(report)));
+            frames.push(frame);
             bar.inc(1);
         }
         bar.finish_and_clear();
         animation::save(&frames, self.fps, &out)?;
         let (width, height) = frames.first().map_or((0, 0), RgbImage::dimensions);
-        let report =
-            Report { output: out, frames: frames.len(), width, height, seconds: began.elapsed().as_secs_f64() };
+        let seconds = began.elapsed().as_secs_f64();
+        let report = Report { output: out, frames: frames.len(), width, height, seconds, plan };
         console.result(&report, || {
             format!(
                 "{}: {} frames of {width}x{height} in {:.1} s",
@@ -139,10 +157,14 @@ impl RenderArguments {
         let [key] = keys.as_slice() else { bail!("--html shows one portrait; {} are named", keys.len()) };
         let scene = key.scene(self.regions);
         let cameras = grid.cameras();
+        let sequence = scene.sequence(&cameras, true)?;
+        let mut plan: Option<FrameReport> = None;
         let bar = console.bar(cameras.len() as u64, "page");
         let mut frames = Vec::with_capacity(cameras.len());
         for camera in &cameras {
-            frames.push(scene.page_frame(camera)?);
+            let (frame, report) = scene.page_frame(camera, sequence.as_ref())?;
+            plan = Some(plan.map_or(report, |plan| plan.and(report)));
+            frames.push(frame);
             bar.inc(1);
         }
         bar.finish_and_clear();
@@ -158,6 +180,7 @@ impl RenderArguments {
             width: side,
             height: side,
             seconds: began.elapsed().as_secs_f64(),
+            plan,
         };
         console.result(&report, || {
             let bytes = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
@@ -186,7 +209,14 @@ impl RenderArguments {
     }
 
     /// Frame `index`: between two portraits codes and tuned weights move together.
-    fn frame(&self, keys: &[Key], index: usize, count: usize, camera: &Camera) -> anyhow::Result<RgbImage> {
+    fn frame(
+        &self,
+        keys: &[Key],
+        index: usize,
+        count: usize,
+        camera: &Camera,
+        sequence: Option<&Sequence>,
+    ) -> anyhow::Result<(RgbImage, FrameReport)> {
         let place = if count > 1 { index as f64 / (count - 1) as f64 * (keys.len() - 1) as f64 } else { 0.0 };
         let left = (place.floor() as usize).min(keys.len().saturating_sub(2));
         let blend = place - left as f64;
@@ -197,10 +227,16 @@ impl RenderArguments {
         };
         let key = blended.as_ref().unwrap_or(from);
         let scene = key.scene(self.regions);
-        let Some(stereo) = self.stereo else { return Ok(side_by_side(&scene.pictures(camera, &self.output)?)) };
+        let Some(stereo) = self.stereo else {
+            let shown = scene.pictures(camera, &self.output, sequence)?;
+            return Ok((side_by_side(&shown.pictures), shown.report));
+        };
         let [left, right] = Stereo::cameras(camera);
-        let (left, right) = (scene.pictures(&left, &self.output)?, scene.pictures(&right, &self.output)?);
-        Ok(side_by_side(&left.iter().zip(&right).map(|(left, right)| stereo.join(left, right)).collect::<Vec<_>>()))
+        let left = scene.pictures(&left, &self.output, sequence)?;
+        let right = scene.pictures(&right, &self.output, sequence)?;
+        let pairs = left.pictures.iter().zip(&right.pictures);
+        let joined: Vec<RgbImage> = pairs.map(|(left, right)| stereo.join(left, right)).collect();
+        Ok((side_by_side(&joined), left.report.and(right.report)))
     }
 }
 
@@ -229,6 +265,7 @@ fn mix(from: &Key, to: &Key, amount: f64) -> anyhow::Result<Key> {
     };
     let device = from.generator.device();
     let generator = Generator::from_tensors(from.generator.config(), weights, &device)?;
+    let generator = generator.with_budget(from.generator.render_settings().budget);
     Ok(Key { generator, codes: between(&from.codes, &to.codes)?, global })
 }
 

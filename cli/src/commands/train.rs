@@ -25,7 +25,7 @@ use serde::Serialize;
 
 use crate::{
     console::{Console, Outcome},
-    options::ModelOptions,
+    options::ModelSource,
 };
 
 /// Arguments of `cnerf train`.
@@ -63,7 +63,7 @@ pub struct TrainArguments {
     lpips: Option<PathBuf>,
     /// Start from --model instead of fresh weights
     #[command(flatten)]
-    model: ModelOptions,
+    model: ModelSource,
 }
 
 #[derive(Serialize)]

@@ -71,9 +71,10 @@ const CHUNK_RAYS: usize = 512;
 const CHUNKS_AT_ONCE: usize = 16;
 /// The share of a budget that may be spent on ending rays early; light falls so fast that more would gain little.
 const CUT_SHARE: f64 = 0.25;
-/// Budgets up to here are rendered exhaustively: what rounding may add to a plan's difference from the exhaustive path, in [0, 1] colour units. Both round the same
-/// sums in another order: a weight's relative error is that of an optical depth t of S terms, at most S t 2⁻²⁴, and
-/// t exp(-t) ≤ 0.37; sigmoids and weighted sums of values in [0, 1] add a few 2⁻²⁴ each.
+/// Budgets up to here are rendered exhaustively: what rounding may add to a plan's difference from the exhaustive path,
+/// in [0, 1] colour units. Both round the same sums in another order: a weight's relative error is that of an optical
+/// depth t of S terms, at most S t 2⁻²⁴, and t exp(-t) ≤ 0.37; sigmoids and weighted sums of values in [0, 1] add a few
+/// 2⁻²⁴ each.
 pub const ROUNDING: f64 = 4e-6;
 /// And for each unit of Σ |m_i c_i|: a sum of nine rounded products of rounded masks, under a sigmoid of slope 1/4.
 const ROUNDING_PER_LOGIT: f64 = 2.5e-7;

@@ -6,7 +6,8 @@
 //! the sum of logits of a sample is off by at most r = Σ |m_i| R_i over what was left out, and its colour, as sigmoid has
 //! slope ≤ 1/4, by at most r / 4; or, taken at the middle of sigmoid's range over ± r, by at most 1/2. Both are at most
 //! Σ min(|m_i| R_i / 4, 1/2), a sum over pairs. The features' activations are sines: what is left out counts as 0 and is
-//! off by at most |m_i| w_s of their range's half, so they are charged the same way, in units of their range.
+//! off by at most |m_i| w_s of their range's half, so they are charged the same way, in units of their range. Normals
+//! are charged too, but have no bound: how steep a region is, is not known before it is evaluated.
 
 use crate::render::plan::{
     ROUNDING, ROUNDING_PER_LOGIT, Shown,
@@ -14,6 +15,12 @@ use crate::render::plan::{
     march::Marched,
     rays::Rays,
 };
+
+/// Normals are of unit length however little light there is to have one, so what is left out of them counts relative to
+/// the ray's opacity. They may lose this many times more than colours: an upsampler takes them as a hint.
+const NORMAL_LENIENCE: f32 = 8.0;
+/// Opacity below which normals fade, as [`crate::render::integrate::aggregate`] has them.
+const FAINT: f32 = 1e-3;
 
 /// A chunk's pairs to evaluate.
 pub struct Selection {
@@ -46,6 +53,7 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
         let rounding = charges.rounding(marched, ray * samples..ray * samples + marched.marched[ray] as usize);
         // A millionth of slack for the rounding of the charges' own sum.
         let budget = ((budget - rounding - marched.spent(ray)) * (1.0 - 1e-6)).max(0.0);
+        let lit = 1.0 / (NORMAL_LENIENCE * (1.0 - marched.remaining[ray] + FAINT));
         // All charges up to here together take at most half of the budget: no need to sort them.
         let negligible = budget / (2 * pairs) as f32;
         let mut spent = 0.0;
@@ -62,7 +70,7 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
             let sample = ray * samples + step;
             let weight = marched.weights[sample];
             for (region, mask) in marched.masks[sample * regions..][..regions].iter().enumerate() {
-                let charge = weight * charges.of(region, *mask);
+                let charge = weight * charges.visible(region, *mask).max(lit * charges.normal(*mask));
                 consider(charge, step * regions + region, &mut || selection.left_out[sample] |= 1 << region);
             }
         }
@@ -85,18 +93,22 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
                 selection.left_out[ray * samples + place / regions] |= 1 << (place % regions);
             }
         }
+        let mut bound = if background { 0.0 } else { behind };
         for step in 0..marched.marched[ray] as usize {
             let sample = ray * samples + step;
             for (region, list) in selection.samples.iter_mut().enumerate() {
                 if selection.left_out[sample] & 1 << region == 0 {
                     list.push(sample as u32);
+                } else {
+                    bound +=
+                        marched.weights[sample] * charges.visible(region, marched.masks[sample * regions + region]);
                 }
             }
         }
         if background {
             selection.background.push(ray as u32);
         }
-        selection.bounds[ray] = spent * (1.0 + 1e-6) + marched.spent(ray) + rounding;
+        selection.bounds[ray] = bound * (1.0 + 1e-6) + marched.spent(ray) + rounding;
     }
     selection
 }
@@ -153,9 +165,14 @@ impl Charges {
         ROUNDING as f32 + ROUNDING_PER_LOGIT as f32 * largest
     }
 
-    fn of(&self, region: usize, mask: f32) -> f32 {
+    /// What leaving a region out can change of colours and features.
+    fn visible(&self, region: usize, mask: f32) -> f32 {
         let mask = mask.abs();
-        let normal = if self.summed { self.normals } else { self.normals * mask };
-        (mask * self.colour[region]).min(0.5).max(mask * self.features[region]).max(normal)
+        (mask * self.colour[region]).min(0.5).max(mask * self.features[region])
+    }
+
+    /// How much of the normal leaving a region out may take away.
+    fn normal(&self, mask: f32) -> f32 {
+        if self.summed { self.normals } else { self.normals * mask.abs() }
     }
 }

@@ -5,13 +5,12 @@ use rayon::prelude::*;
 
 use crate::{
     camera,
-    config::DensityKind,
     error::Result,
     render::{
         RadianceField, RenderSettings, TwoPass, frame,
         plan::{
             CUT_SHARE, Chunk, FrameReport, Method, Parts, Planned, Shown, View, exhaustive, fields,
-            grid::Grid,
+            grid::{Grid, Place},
             local::{LocalField, LocalInitial, Ready, length},
             march::{Light, Marched},
             rays::Rays,
@@ -139,7 +138,7 @@ impl Shared {
         let (rays, mut state, marched) = match &settings.two_pass {
             Some(two_pass) => self.march_to_the_surface(rays, settings, two_pass, &mut room)?,
             None => {
-                let mut state = self.state(&rays);
+                let mut state = ChunkState::new(&self.ready, rays.depths.len());
                 let marched = self.march(&rays, budget, &mut state, &mut room)?;
                 (rays, state, marched)
             }
@@ -149,19 +148,10 @@ impl Shared {
         Ok((rays, Chunk { marched, selection, pixels }))
     }
 
-    /// Nothing known; regions that are left out of a cell have no mask there.
-    fn state(&self, rays: &Rays) -> ChunkState {
-        let mut state = ChunkState::new(&self.ready, rays.depths.len());
-        if matches!(self.ready.local.fusion, crate::config::Fusion::Softmax { .. }) {
-            state.raw.chunks_exact_mut(2).for_each(|raw| raw[0] = f32::NEG_INFINITY);
-        }
-        state
-    }
-
     /// Marches rays at their own depths.
     fn march(&self, rays: &Rays, budget: f64, state: &mut ChunkState, room: &mut Room) -> Result<Marched> {
-        let (samples, regions) = (rays.samples, self.ready.regions.len());
-        let mut marched = Marched::new(rays, regions);
+        let samples = rays.samples;
+        let mut marched = Marched::new(rays, self.ready.regions.len());
         let cut = (budget * CUT_SHARE) as f32;
         // What each sample may spend of its pixel.
         let spendable = (budget * INTERPOLATION_SHARE) as f32 / samples as f32;
@@ -205,6 +195,9 @@ impl Shared {
         }
         marched.samples_evaluated = exact.len();
         marched.shape_pairs = state.fill_shapes(&self.ready, rays, &exact, |place| wanted[place], room)?;
+        for (sample, wanted) in exact.iter().zip(&wanted) {
+            self.interpolate(places[*sample as usize], !wanted, *sample as usize, state);
+        }
         for ray in 0..rays.count() {
             let mut light = Light::default();
             let mut end = marched.marched[ray] as usize;
@@ -215,9 +208,9 @@ impl Shared {
                     let weight =
                         light.pass(self.ready.density(marched.distances[sample]), rays.lengths[sample], takes_all);
                     marched.weights[sample] = weight;
-                    if let Some(place) = places[sample].filter(|_| weight != 0.0) {
-                        self.grid.masks(place, &mut marched.masks[sample * regions..][..regions]);
-                        marched.means[sample] = self.mean(rays.point(sample), marched.distances[sample]);
+                    if weight != 0.0 {
+                        self.interpolate(places[sample], u16::MAX, sample, state);
+                        marched.fuse(&self.ready, rays, state, sample);
                     }
                 } else {
                     marched.fuse(&self.ready, rays, state, sample);
@@ -243,12 +236,11 @@ impl Shared {
         Ok(marched)
     }
 
-    /// Σ m_i Δd_i where only the whole distance is known: right for gated residuals, the only ones that need it.
-    fn mean(&self, point: [f32; 3], distance: f32) -> f32 {
-        match (self.ready.local.density, &self.ready.local.initial) {
-            (DensityKind::Density, _) => -distance,
-            (DensityKind::ResidualSdf, LocalInitial::Sphere { radius }) => distance - (length(point) - *radius as f32),
-            _ => distance,
+    /// Puts interpolated raw values of the regions `wanted` (bits) in the place of evaluated ones.
+    fn interpolate(&self, place: Option<Place>, wanted: u16, sample: usize, state: &mut ChunkState) {
+        let values = 2 * self.ready.regions.len();
+        if let Some(place) = place {
+            self.grid.raw(place, wanted, &mut state.raw[sample * values..][..values]);
         }
     }
 
@@ -282,7 +274,7 @@ impl Shared {
         rays.samples = samples;
         rays.depths = depths;
         rays.lengths = vec![0.0; rays.depths.len()];
-        let mut state = self.state(&rays);
+        let mut state = ChunkState::new(&self.ready, rays.depths.len());
         let mut marched = Marched::new(&rays, regions);
         let (mut lit, mut wanted) = (Vec::new(), Vec::new());
         for ray in 0..rays.count() {
@@ -303,8 +295,10 @@ impl Shared {
         }
         marched.samples_evaluated = lit.len();
         marched.shape_pairs = state.fill_shapes(&self.ready, &rays, &lit, |place| wanted[place], room)?;
-        for sample in lit {
-            marched.fuse(&self.ready, &rays, &state, sample as usize);
+        for (sample, wanted) in lit.into_iter().zip(wanted) {
+            let sample = sample as usize;
+            self.interpolate(self.grid.place(rays.point(sample)), !wanted, sample, &mut state);
+            marched.fuse(&self.ready, &rays, &state, sample);
         }
         Ok((rays, state, marched))
     }
