@@ -58,6 +58,14 @@ impl ModelOptions {
     }
 }
 
+impl std::ops::Deref for ModelOptions {
+    type Target = ModelSource;
+
+    fn deref(&self) -> &ModelSource {
+        &self.source
+    }
+}
+
 impl ModelSource {
     /// The model asked for, or `default`.
     pub fn load_or(&self, default: &str) -> anyhow::Result<Generator> {

@@ -324,8 +324,7 @@ impl Parts {
         pixels: &Pixels,
     ) -> Result<()> {
         let rows = |values: &[f32], channels: usize| -> Result<Tensor> {
-            let values = Tensor::from_slice(values, (1, count, channels), &Device::Cpu)?;
-            Ok(values.transpose(1, 2)?.contiguous()?)
+            Ok(Tensor::from_vec(transposed(values, count, channels), (1, channels, count), &Device::Cpu)?)
         };
         self.colour.push(rows(&pixels.colour, 3)?.affine(2.0, -1.0)?);
         let masks = rows(&pixels.masks, REGION_COUNT)?;
@@ -333,8 +332,8 @@ impl Parts {
         let directions = bundle.directions.narrow(0, image, 1)?;
         if view.settings.features {
             let width = pixels.activations.len() / (count * REGION_COUNT).max(1);
-            let activations = Tensor::from_slice(&pixels.activations, (1, count, REGION_COUNT, width), &Device::Cpu)?;
-            let activations = activations.permute((0, 2, 3, 1))?.contiguous()?;
+            let activations = rows(&pixels.activations, REGION_COUNT * width)?;
+            let activations = activations.reshape((1, REGION_COUNT, width, count))?;
             let views = bundle.view_directions.narrow(0, image, 1)?;
             // Weights of features are all portraits', so the picture's number does not matter.
             self.features.push(field.features(&activations, &masks, Some(&views))?.detach());
@@ -377,4 +376,21 @@ impl Parts {
             opacity: present(&self.opacity)?,
         })
     }
+}
+
+/// `[rows, columns]` to `[columns, rows]`, block by block, so that both stay in cache.
+fn transposed(values: &[f32], rows: usize, columns: usize) -> Vec<f32> {
+    const BLOCK: usize = 16;
+    let mut result = vec![0.0; values.len()];
+    for first_row in (0..rows).step_by(BLOCK) {
+        let last_row = rows.min(first_row + BLOCK);
+        for first_column in (0..columns).step_by(BLOCK) {
+            for column in first_column..columns.min(first_column + BLOCK) {
+                for row in first_row..last_row {
+                    result[column * rows + row] = values[row * columns + column];
+                }
+            }
+        }
+    }
+    result
 }

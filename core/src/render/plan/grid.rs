@@ -136,13 +136,16 @@ impl Grid {
 
     /// Writes the raw values of the regions `wanted` (bits), interpolated, among `raw` `[k, 2]`.
     pub fn raw(&self, place: Place, wanted: u16, raw: &mut [f32]) {
-        let wanted = |region: usize| wanted & 1 << region != 0;
-        for (region, values) in raw.chunks_exact_mut(2).enumerate().filter(|(region, _)| wanted(*region)) {
-            values.fill(0.0);
-            for (vertex, share) in self.corners(place) {
-                let corner = &self.raw[(vertex * self.regions + region) * 2..][..2];
-                values[0] += share * corner[0];
-                values[1] += share * corner[1];
+        let mut sums = [0f32; 2 * REGION_COUNT];
+        let sums = &mut sums[..2 * self.regions];
+        for (vertex, share) in self.corners(place) {
+            for (sum, value) in sums.iter_mut().zip(&self.raw[vertex * 2 * self.regions..]) {
+                *sum += share * value;
+            }
+        }
+        for (region, (values, sums)) in raw.chunks_exact_mut(2).zip(sums.chunks_exact(2)).enumerate() {
+            if wanted & 1 << region != 0 {
+                values.copy_from_slice(sums);
             }
         }
     }

@@ -42,6 +42,7 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
     let (count, samples, regions) = (rays.count(), rays.samples, field.regions.len());
     let pairs = samples * regions + 1;
     let charges = Charges::new(field, shown);
+    let every = ((1u32 << regions) - 1) as u16;
     let mut selection = Selection {
         samples: vec![Vec::new(); regions],
         left_out: vec![0; count * samples],
@@ -51,16 +52,16 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
     let mut candidates = Candidates::new();
     for ray in 0..count {
         let rounding = charges.rounding(marched, ray * samples..ray * samples + marched.marched[ray] as usize);
-        // A millionth of slack for the rounding of the charges' own sum.
-        let budget = ((budget - rounding - marched.spent(ray)) * (1.0 - 1e-6)).max(0.0);
+        // A little slack for the rounding of the charges' own sum.
+        let budget = ((budget - rounding - marched.spent(ray)) * (1.0 - 1e-5)).max(0.0);
         let lit = 1.0 / (NORMAL_LENIENCE * (1.0 - marched.remaining[ray] + FAINT));
         // All charges up to here together take at most half of the budget: no need to sort them.
         let negligible = budget / (2 * pairs) as f32;
-        let mut spent = 0.0;
+        let mut spent = 0f32;
         candidates.clear();
-        let mut consider = |charge: f32, place: usize, leave_out: &mut dyn FnMut()| {
+        let mut consider = |spent: &mut f32, charge: f32, place: usize, leave_out: &mut dyn FnMut()| {
             if charge <= negligible {
-                spent += charge;
+                *spent += charge;
                 leave_out();
             } else if charge <= budget {
                 candidates.push(u64::from(charge.to_bits()) << 32 | place as u64);
@@ -69,15 +70,23 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
         for step in 0..marched.marched[ray] as usize {
             let sample = ray * samples + step;
             let weight = marched.weights[sample];
+            // Most samples are empty space: with shares for masks a look at the weight is enough.
+            if weight * charges.largest(lit) <= negligible {
+                spent += weight * charges.largest(lit);
+                selection.left_out[sample] = every;
+                continue;
+            }
             for (region, mask) in marched.masks[sample * regions..][..regions].iter().enumerate() {
                 let charge = weight * charges.visible(region, *mask).max(lit * charges.normal(*mask));
-                consider(charge, step * regions + region, &mut || selection.left_out[sample] |= 1 << region);
+                consider(&mut spent, charge, step * regions + region, &mut || {
+                    selection.left_out[sample] |= 1 << region
+                });
             }
         }
         let mut background = field.background.is_some();
         let behind = marched.remaining[ray] * charges.background;
         if background {
-            consider(behind, samples * regions, &mut || background = false);
+            consider(&mut spent, behind, samples * regions, &mut || background = false);
         }
         candidates.sort_unstable();
         for candidate in &candidates {
@@ -96,6 +105,11 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
         let mut bound = if background { 0.0 } else { behind };
         for step in 0..marched.marched[ray] as usize {
             let sample = ray * samples + step;
+            if selection.left_out[sample] == every && charges.shares {
+                // Nothing evaluated is the middle of [0, 1] at worst.
+                bound += 0.5 * marched.weights[sample];
+                continue;
+            }
             for (region, list) in selection.samples.iter_mut().enumerate() {
                 if selection.left_out[sample] & 1 << region == 0 {
                     list.push(sample as u32);
@@ -126,6 +140,8 @@ struct Charges {
     background: f32,
     /// Per region, the largest |c_i|.
     logits: Vec<f32>,
+    /// Whether masks are shares of 1.
+    shares: bool,
 }
 
 impl Charges {
@@ -152,6 +168,7 @@ impl Charges {
             summed: field.local.residual == crate::config::Residual::Sum,
             background,
             logits: field.ranges.iter().map(LogitRange::largest).collect(),
+            shares: matches!(field.local.fusion, crate::config::Fusion::Softmax { .. }),
         }
     }
 
@@ -163,6 +180,11 @@ impl Charges {
             masks.map(|masks| masks.iter().zip(&self.logits).map(|(mask, logit)| mask.abs() * logit).sum::<f32>());
         let largest = logits.fold(0.0, f32::max);
         ROUNDING as f32 + ROUNDING_PER_LOGIT as f32 * largest
+    }
+
+    /// The most that all regions of a sample together can be charged, where masks are shares.
+    fn largest(&self, lit: f32) -> f32 {
+        if self.shares { self.logits.len() as f32 * (lit * self.normals).max(0.5) } else { f32::INFINITY }
     }
 
     /// What leaving a region out can change of colours and features.

@@ -155,6 +155,8 @@ impl Shared {
         let cut = (budget * CUT_SHARE) as f32;
         // What each sample may spend of its pixel.
         let spendable = (budget * INTERPOLATION_SHARE) as f32 / samples as f32;
+        // Light that may come from nowhere without a closer look: a thousandth of that.
+        let empty = spendable * 1e-3;
         let (mut exact, mut wanted) = (Vec::new(), Vec::new());
         let mut places = vec![None; rays.depths.len()];
         let mut interpolated = vec![false; rays.depths.len()];
@@ -173,9 +175,15 @@ impl Shared {
                 let estimate = self.grid.estimate_at(place);
                 let distance = self.grid.distance(place);
                 marched.distances[sample] = distance;
+                // Far from the surface, where nearly all samples are, the rest would compute zeros.
+                let dark = self.ready.density(distance - estimate.distance) * rays.lengths[sample];
+                if dark <= empty {
+                    interpolated[sample] = true;
+                    marched.estimated[ray] += dark;
+                    continue;
+                }
                 let arriving = brightest.left();
                 let optical = |distance: f32| self.ready.density(distance) * rays.lengths[sample];
-                let dark = optical(distance - estimate.distance);
                 let bright = optical(distance + estimate.distance);
                 let weight = light.pass(self.ready.density(distance), rays.lengths[sample], takes_all);
                 brightest.pass(self.ready.density(distance + estimate.distance), rays.lengths[sample], takes_all);
@@ -208,7 +216,9 @@ impl Shared {
                     let weight =
                         light.pass(self.ready.density(marched.distances[sample]), rays.lengths[sample], takes_all);
                     marched.weights[sample] = weight;
-                    if weight != 0.0 {
+                    if weight <= empty {
+                        marched.estimated[ray] += weight;
+                    } else {
                         self.interpolate(places[sample], u16::MAX, sample, state);
                         marched.fuse(&self.ready, rays, state, sample);
                     }

@@ -19,6 +19,10 @@ use crate::{
 /// up to here a quarter of it is the smaller bound.
 const UNCERTAIN: f32 = 2.0;
 
+/// Weights of samples whose masks, if nothing of them is evaluated, are not worth summing: a thousand of them would not
+/// show in f32.
+const TRACE: f32 = 1e-9;
+
 /// A chunk's pixels, ray by ray.
 pub struct Pixels {
     /// `[n, 3]` in [0, 1].
@@ -93,6 +97,10 @@ pub fn shade(
                 continue;
             }
             depth += weight * rays.depths[sample];
+            if weight <= TRACE && selection.left_out[sample] == doubts.every {
+                add_scaled(&mut colour, weight, &[0.5; 3]);
+                continue;
+            }
             let sample_masks = &marched.masks[sample * regions..][..regions];
             for (row, mask) in field.rows().zip(sample_masks) {
                 masks[row] += weight * mask;
@@ -231,6 +239,7 @@ struct Doubts {
     middle: Vec<[f32; 3]>,
     radius: Vec<[f32; 3]>,
     visible: u16,
+    every: u16,
 }
 
 impl Doubts {
@@ -240,6 +249,7 @@ impl Doubts {
             middle: field.ranges.iter().map(|range| range.middle).collect(),
             radius: field.ranges.iter().map(|range| range.radius).collect(),
             visible: visible.fold(0, |bits, (index, _)| bits | 1 << index),
+            every: ((1u32 << field.regions.len()) - 1) as u16,
         }
     }
 
