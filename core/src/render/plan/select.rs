@@ -105,8 +105,8 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
         let mut bound = if background { 0.0 } else { behind };
         for step in 0..marched.marched[ray] as usize {
             let sample = ray * samples + step;
-            if selection.left_out[sample] == every && charges.shares {
-                // Nothing evaluated is the middle of [0, 1] at worst.
+            if marched.weights[sample] * charges.largest(lit) <= negligible {
+                // At worst, what is left out as a whole is the middle of [0, 1].
                 bound += 0.5 * marched.weights[sample];
                 continue;
             }
