@@ -1,6 +1,7 @@
 //! The commands. Each module holds a command's raw arguments, resolves them into settings, calls the libraries, and
 //! reports.
 
+mod bench;
 mod convert;
 mod dataset;
 mod edit;
@@ -53,6 +54,9 @@ enum Command {
     /// Measure a model, or portraits, against held-out data
     #[command(subcommand)]
     Eval(eval::EvalCommand),
+    /// Measure speed and exactness beside the plain path
+    #[command(subcommand)]
+    Bench(bench::BenchCommand),
     /// Read the authors' PyTorch checkpoints
     Convert(convert::ConvertArguments),
     /// Say what a model, portrait or dataset holds
@@ -76,6 +80,7 @@ pub fn run(arguments: Arguments, console: &Console) -> anyhow::Result<Outcome> {
         Command::Render(render) => render.run(seed, console),
         Command::Export(export) => export.run(console),
         Command::Eval(eval) => eval.run(seed.unwrap_or(0), console),
+        Command::Bench(bench) => bench.run(console),
         Command::Convert(convert) => convert.run(console),
         Command::Info(info) => info.run(console),
         Command::Completions(completions) => completions.run(),

@@ -3,8 +3,9 @@
 //!
 //! A floor uses only floors below it:
 //! vocabulary ([`region`], [`camera`], [`codes`], [`config`], [`parameters`], [`rng`], [`files`], [`error`]) →
-//! [`kernels`] → [`render`] → [`model`] → [`data`] / [`train`] → [`eval`] / [`interop`].
+//! [`kernels`] → [`render`] → [`model`] → [`data`] / [`train`] → [`eval`] / [`interop`] → [`bench`].
 
+pub mod bench;
 pub mod camera;
 pub mod codes;
 pub mod config;

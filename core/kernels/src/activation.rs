@@ -10,7 +10,7 @@ use crate::{Error, Result};
 
 /// x · sigmoid(x), any shape.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
-    if !is_fused(&[x]) {
+    if !is_fused(&[x])? {
         return Ok(x.silu()?);
     }
     Ok(x.contiguous()?.apply_op1(Silu)?)
@@ -20,7 +20,7 @@ pub fn silu(x: &Tensor) -> Result<Tensor> {
 /// the channels: `[B, 2C, h, w]`, or `[B, 2C, 1, 1]` for the same at all pixels.
 pub fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<Tensor> {
     let (batch, channels, height, width) = x.dims4()?;
-    if modulation.dims() == [batch, 2 * channels, height, width] && is_fused(&[x, modulation]) {
+    if modulation.dims() == [batch, 2 * channels, height, width] && is_fused(&[x, modulation])? {
         return Ok(x.contiguous()?.apply_op2(&modulation.contiguous()?, ModulatedSilu)?);
     }
     if modulation.dim(1)? != 2 * channels {
@@ -32,8 +32,9 @@ pub fn modulated_silu(x: &Tensor, modulation: &Tensor) -> Result<Tensor> {
 }
 
 /// Whether the passes of this module can do it; else candle does.
-fn is_fused(tensors: &[&Tensor]) -> bool {
-    tensors.iter().all(|tensor| tensor.device().is_cpu() && tensor.dtype() == DType::F32)
+fn is_fused(tensors: &[&Tensor]) -> Result<bool> {
+    let fits = tensors.iter().all(|tensor| tensor.device().is_cpu() && tensor.dtype() == DType::F32);
+    Ok(fits && !crate::Path::is_composed()?)
 }
 
 /// sigmoid(x) to about 2 units in the last place, without branches, so that loops over it become vector code.

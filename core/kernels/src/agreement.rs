@@ -4,7 +4,6 @@ use candle_core::{DType, Device, Tensor, Var};
 
 use super::{
     Evaluation, Extent, Gradients, HeadShape, Outputs, RegionKernel, autograd, composed, fused, kernels, plain::Plain,
-    select,
 };
 use crate::{FILM_LAYERS, SdfHead, random::Stream};
 
@@ -343,16 +342,6 @@ fn huge_angles_in_deep_layers_and_nan_are_not_hidden() {
             assert!(case.answer(kernel).result[0].is_nan(), "{} hides {poison}", kernel.name());
         }
     }
-}
-
-#[test]
-fn kernels_are_chosen_by_name() {
-    for name in ["plain", "portable"] {
-        assert_eq!(select(Some(name)).unwrap().name(), name);
-    }
-    let message = select(Some("fpga")).map(|kernel| kernel.name()).unwrap_err().to_string();
-    assert!(message.starts_with("CNERF_KERNEL: no kernel `fpga`") && message.contains("portable"), "{message}");
-    assert!(select(None).unwrap().available());
 }
 
 #[test]

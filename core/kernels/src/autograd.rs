@@ -2,7 +2,7 @@
 
 use candle_core::{CpuStorage, CustomOp3, DType, Device, Layout, Shape, Storage, Tensor};
 
-use super::{Evaluation, Extent, Gradients, HeadShape, Outputs, RegionKernel, composed, selected};
+use super::{Evaluation, Extent, Gradients, HeadShape, Outputs, Path, RegionKernel, composed};
 use crate::Result;
 
 /// Evaluates every region at every point of its image, differentiable to first order in all three tensors; gradient
@@ -13,7 +13,7 @@ use crate::Result;
 /// - `film` [B, k, 5, 2, W], γ then β of each layer;
 /// - the result is [B, k, C, N], rows as [`HeadShape::rows`].
 ///
-/// f32 on the CPU runs on the [`selected`] kernel, all else on [`composed`]. A tensor that no variable led to gets no
+/// f32 on the CPU runs on the kernel of the current [`Path`], all else on [`composed`]. A tensor that no variable led to gets no
 /// gradient (detach `points` to save the work and memory of theirs).
 ///
 /// # Errors
@@ -25,10 +25,11 @@ pub fn evaluate(
     shape: HeadShape,
     outputs: Outputs,
 ) -> Result<Tensor> {
-    if matches!(points.device(), Device::Cpu) && points.dtype() == DType::F32 {
-        evaluate_with(selected()?, points, weights, film, shape, outputs)
-    } else {
-        composed::evaluate(points, weights, film, shape, outputs)
+    match Path::current()? {
+        Path::Kernel(kernel) if matches!(points.device(), Device::Cpu) && points.dtype() == DType::F32 => {
+            evaluate_with(kernel, points, weights, film, shape, outputs)
+        }
+        _ => composed::evaluate(points, weights, film, shape, outputs),
     }
 }
 

@@ -27,7 +27,7 @@ mod weight_gradient;
 #[cfg(test)]
 mod tests;
 
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, DType, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 
 use self::activation::ChannelSums;
 pub use self::activation::{bias_leaky_relu, leaky_relu_gradient};
@@ -49,7 +49,7 @@ pub fn conv2d(input: &Tensor, weight: &Tensor, bias: Option<&Tensor>, stride: us
     {
         return Err(Error::shape("convolution bias", [geometry.output_channels], bias.dims()));
     }
-    if !is_direct(&geometry, &[input, weight]) {
+    if !is_direct(&geometry, &[input, weight])? {
         return Ok(composed::forward(&geometry, input, weight, bias)?);
     }
     let convolution = Convolution { geometry, path: Path::chosen()? };
@@ -78,7 +78,7 @@ pub fn conv2d_input_gradient(
     let input_shape = [batch, channels, input_size.0, input_size.1];
     let geometry = Geometry::new(&input_shape, weight.dims(), stride, padding)?;
     geometry.check_output("gradient of a convolution's output", grad_output)?;
-    if !is_direct(&geometry, &[grad_output, weight]) {
+    if !is_direct(&geometry, &[grad_output, weight])? {
         return Ok(composed::input_gradient(&geometry, grad_output, weight)?);
     }
     let gradient = InputGradient { geometry, path: Path::chosen()? };
@@ -103,7 +103,7 @@ pub fn conv2d_weight_gradient(
     let weight_shape = [output_channels, input_channels, kernel_size.0, kernel_size.1];
     let geometry = Geometry::new(input.dims(), &weight_shape, stride, padding)?;
     geometry.check_output("gradient of a convolution's output", grad_output)?;
-    if !is_direct(&geometry, &[input, grad_output]) {
+    if !is_direct(&geometry, &[input, grad_output])? {
         return Ok(composed::weight_gradient(&geometry, input, grad_output)?);
     }
     let gradient = WeightGradient { geometry, path: Path::chosen()? };
@@ -141,8 +141,8 @@ pub fn conv_transpose2d(
 }
 
 /// Whether the kernels of this module can do it; else candle does.
-fn is_direct(geometry: &Geometry, tensors: &[&Tensor]) -> bool {
-    !geometry.is_empty() && tensors.iter().all(|tensor| tensor.device().is_cpu() && tensor.dtype() == DType::F32)
+fn is_direct(geometry: &Geometry, tensors: &[&Tensor]) -> Result<bool> {
+    Ok(!geometry.is_empty() && activation::is_direct(tensors)?)
 }
 
 impl Geometry {

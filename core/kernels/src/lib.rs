@@ -3,16 +3,18 @@
 //! A local generator is five FiLM-SIREN layers with three heads (paper, "Local generators"):
 //! h_l = sin(γ_l ∘ (W_l h_{l-1} + b_l) + β_l) with h_0 the point; the mask reads h_3, the residual distance h_3 or h_5
 //! ([`SdfHead`]), the colour h_5. [`autograd::evaluate`] is the door: a differentiable candle function over whichever
-//! [`RegionKernel`] the processor runs best; [`prepared`] the way in for renderers that leave most of the work out. [`plain`] is the reference anybody can check, [`composed`] the same in
-//! candle operations for other devices, [`fused`] the fast one.
+//! [`RegionKernel`] the processor runs best; [`prepared`] the way in for renderers that leave most of the work out.
+//! [`plain`] is the reference anybody can check, [`composed`] the same in candle operations for other devices, [`fused`]
+//! the fast one; a [`Path`] says which of them is used.
 
-use std::{ops::Range, sync::OnceLock};
+use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
 #[cfg(test)]
 mod agreement;
 mod error;
+mod path;
 #[cfg(test)]
 mod random;
 
@@ -21,11 +23,13 @@ pub mod autograd;
 pub mod composed;
 pub mod conv;
 pub mod fused;
+pub mod peak;
 pub mod plain;
 pub mod prepared;
 pub mod simd;
 
 pub use error::{Error, Result};
+pub use path::{KERNEL_VARIABLE, Path, selected};
 pub use prepared::PreparedRegion;
 
 /// Which branch of a local generator carries the residual distance head.
@@ -307,38 +311,6 @@ pub fn kernels() -> impl Iterator<Item = &'static dyn RegionKernel<f32>> {
     #[cfg(not(target_arch = "x86_64"))]
     let wide: [&dyn RegionKernel<f32>; 0] = [];
     wide.into_iter().chain([&fused::PORTABLE as &dyn RegionKernel<f32>, &plain::Plain])
-}
-
-/// The kernel called `name`, or without a name the fastest that this processor can run.
-///
-/// # Errors
-/// If there is no such kernel here.
-pub fn select(name: Option<&str>) -> Result<&'static dyn RegionKernel<f32>> {
-    let mut candidates = kernels().filter(|kernel| kernel.available());
-    let Some(name) = name else {
-        return Ok(candidates.next().unwrap_or(&plain::Plain));
-    };
-    candidates.find(|kernel| kernel.name() == name).ok_or_else(|| {
-        let names: Vec<_> = kernels().filter(|kernel| kernel.available()).map(|kernel| kernel.name()).collect();
-        Error::config(KERNEL_VARIABLE, format!("no kernel `{name}` on this processor; use one of {}", names.join(", ")))
-    })
-}
-
-/// The environment variable that chooses a kernel by name.
-pub const KERNEL_VARIABLE: &str = "CNERF_KERNEL";
-
-/// The kernel that [`KERNEL_VARIABLE`] asks for, or the fastest; looked up once a process.
-///
-/// # Errors
-/// If the variable names no kernel of this processor.
-pub fn selected() -> Result<&'static dyn RegionKernel<f32>> {
-    static SELECTED: OnceLock<&'static dyn RegionKernel<f32>> = OnceLock::new();
-    if let Some(kernel) = SELECTED.get() {
-        return Ok(*kernel);
-    }
-    let name = std::env::var_os(KERNEL_VARIABLE).map(|name| name.to_string_lossy().into_owned());
-    let kernel = select(name.as_deref())?;
-    Ok(*SELECTED.get_or_init(|| kernel))
 }
 
 #[cfg(test)]

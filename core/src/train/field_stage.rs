@@ -215,8 +215,8 @@ impl FieldStage {
         Ok(total)
     }
 
-    /// The generator's whole loss at `step`.
-    fn generator_loss(&self, step: usize, metrics: &mut Metrics) -> Result<Tensor> {
+    /// The generator's whole loss at `step`, a scalar; its terms join `metrics`. Errs if one is not finite.
+    pub(crate) fn generator_loss(&self, step: usize, metrics: &mut Metrics) -> Result<Tensor> {
         let config = &self.config;
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
         let codes = self.draw_codes(&mut random)?;

@@ -22,7 +22,7 @@ pub fn bias_leaky_relu(input: &Tensor, bias: Option<&Tensor>, slope: f64, gain: 
             if bias.dims().first().copied() != channels || bias.rank() != 1 {
                 return Err(Error::shape("bias of a leaky ReLU", [channels.unwrap_or_default()], bias.dims()));
             }
-            if is_direct(&[input, bias]) {
+            if is_direct(&[input, bias])? {
                 return Ok(input.contiguous()?.apply_op2(&bias.contiguous()?, activation)?);
             }
             let mut shape = vec![1; input.rank()];
@@ -30,7 +30,7 @@ pub fn bias_leaky_relu(input: &Tensor, bias: Option<&Tensor>, slope: f64, gain: 
             input.broadcast_add(&bias.reshape(shape)?)?
         }
     };
-    if is_direct(&[&input]) {
+    if is_direct(&[&input])? {
         return Ok(input.contiguous()?.apply_op1(activation)?);
     }
     Ok((&input * activation.slopes(&input)?)?)
@@ -47,7 +47,7 @@ pub fn leaky_relu_gradient(output: &Tensor, grad_output: &Tensor, slope: f64, ga
     }
     let activation = Activation::new(slope, gain)?;
     let output = output.detach();
-    if is_direct(&[&output, grad_output]) {
+    if is_direct(&[&output, grad_output])? {
         return Ok(output.contiguous()?.apply_op2(&grad_output.contiguous()?, Gradient(activation))?);
     }
     Ok((grad_output * activation.slopes(&output)?)?)
@@ -56,8 +56,10 @@ pub fn leaky_relu_gradient(output: &Tensor, grad_output: &Tensor, slope: f64, ga
 /// Values that one task treats: enough to be worth a thread's attention.
 const TASK: usize = 1 << 14;
 
-fn is_direct(tensors: &[&Tensor]) -> bool {
-    tensors.iter().all(|tensor| tensor.device().is_cpu() && tensor.dtype() == DType::F32)
+/// Whether the kernels of this module can do it; else candle does.
+pub(super) fn is_direct(tensors: &[&Tensor]) -> Result<bool> {
+    let fits = tensors.iter().all(|tensor| tensor.device().is_cpu() && tensor.dtype() == DType::F32);
+    Ok(fits && !crate::Path::is_composed()?)
 }
 
 /// A leaky ReLU that scales by `above` what is above zero, and by `below` the rest.

@@ -1,0 +1,313 @@
+//! One frame: exact on every path against candle's own operations; under budgets of error; and how far sums of so many
+//! samples are from the integral they stand for.
+
+use candle_core::Tensor;
+use serde::Serialize;
+
+use crate::{
+    bench::{
+        Machine,
+        chart::{self, Axis, Caption, Curve, Group},
+        generators::{self, Speed},
+        measure::{Timing, Way, in_turns},
+        scene::{Scene, difference, with_samples},
+    },
+    error::{Error, Result},
+    eval::quality,
+    kernels::{FILM_LAYERS, Path},
+    model::field::PortraitField,
+    render::{RadianceField as _, RenderSettings, TwoPass, plan},
+};
+
+/// Budgets that frames are rendered under, [0, 1] colour units: from below what a screen shows to twice it.
+pub const BUDGETS: [f64; 6] = [5e-4, 1e-3, 2e-3, 1.0 / 255.0, 0.01, 0.03];
+/// Samples of the sum that counts as the integral.
+const CONVERGED_SAMPLES: usize = 1024;
+/// Samples a ray whose sums are compared to it.
+const SAMPLES: [usize; 8] = [4, 6, 8, 12, 16, 24, 48, 96];
+/// Colour samples at the surface that each number of distance samples goes with: a quarter, at least two.
+const COLOUR_SHARE: usize = 4;
+
+/// The exact frame on one path.
+#[derive(Clone, Debug, Serialize)]
+pub struct PathReport {
+    /// Which.
+    pub path: &'static str,
+    /// Median seconds.
+    pub seconds: f64,
+    /// Times faster than candle's operations.
+    pub speedup: f64,
+    /// Largest difference from candle's picture, [0, 1] colour units.
+    pub max_difference: f64,
+    /// All measurements.
+    pub timing: Timing,
+}
+
+/// A frame under a budget.
+#[derive(Clone, Debug, Serialize)]
+pub struct BudgetReport {
+    /// Largest error allowed, [0, 1] colour units; 0 is the exhaustive path.
+    pub budget: f64,
+    /// Median seconds.
+    pub seconds: f64,
+    /// Times faster than the exact frame in this run.
+    pub speedup: f64,
+    /// Largest difference from the exact frame that was found.
+    pub max_error: f64,
+    /// The pixels' mean difference.
+    pub mean_error: f64,
+    /// Largest difference that the plan said there could be.
+    pub bound: f64,
+    /// (sample, region) pairs whose texture branch ran.
+    pub regions_evaluated: usize,
+    /// Samples where any branch ran.
+    pub samples_evaluated: usize,
+    /// (sample, region) pairs whose shape branch ran.
+    pub shape_pairs_evaluated: usize,
+    /// Pairs left out.
+    pub pairs_skipped: usize,
+}
+
+/// A sum of so many samples against the integral.
+#[derive(Clone, Debug, Serialize)]
+pub struct DiscretisationReport {
+    /// Samples a ray at which the distance is evaluated.
+    pub samples: usize,
+    /// Samples a ray at which colours are.
+    pub colour_samples: usize,
+    /// `uniform` or `surface`.
+    pub placement: &'static str,
+    /// Median seconds.
+    pub seconds: f64,
+    /// Of the picture against the one of 1024 samples, dB.
+    pub psnr: f64,
+}
+
+/// Everything about one frame.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Sample points a second of the exact frame on the first path.
+    pub points_per_s: f64,
+    /// 10⁹ operations a second of the local generators in that frame, everything else's time included.
+    pub gflops: f64,
+    /// The first path's ceiling.
+    pub peak_gflops: f64,
+    /// Candle's own operations, same allocator and matrix products: median seconds.
+    pub plain_seconds: f64,
+    /// The first path: median seconds.
+    pub exact_seconds: f64,
+    /// Frames under budgets.
+    pub budgeted: Vec<BudgetReport>,
+    /// Sums against the integral.
+    pub discretisation: Vec<DiscretisationReport>,
+    /// The exact frame on every path.
+    pub paths: Vec<PathReport>,
+    /// The kernels alone on every path.
+    pub generators: Vec<Speed>,
+    /// What was rendered.
+    pub scene: String,
+    /// Where.
+    pub machine: Machine,
+}
+
+/// Measures one frame of `scene`; `paths` are kernels, the first is the one that budgets and sums are measured on.
+pub fn run(
+    scene: &Scene,
+    paths: &[Path],
+    budgets: &[f64],
+    repeats: usize,
+    machine: Machine,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Report> {
+    let first = *paths.first().ok_or_else(|| Error::config("--paths", "name at least one kernel"))?;
+    let field = scene.generator.field().portraits(&scene.codes)?.detached();
+    let camera = scene.camera()?;
+    let exact = RenderSettings { budget: 0.0, ..scene.settings.clone() };
+    let picture = |path: Path, settings: &RenderSettings| -> Result<Tensor> {
+        path.run(|| Ok(plan::render(&field, &camera, settings)?.frame.colour))
+    };
+
+    progress("exact frame");
+    let all: Vec<Path> = paths.iter().copied().chain([Path::Composed]).collect();
+    let mut ways: Vec<Way<'_>> =
+        all.iter().map(|path| -> Way<'_> { Box::new(|| picture(*path, &exact).map(drop)) }).collect();
+    let mut timings = in_turns(repeats, &mut ways)?;
+    drop(ways);
+    let plain = timings.pop().unwrap_or_else(|| Timing::of(Vec::new()));
+    let reference = picture(Path::Composed, &exact)?;
+    let mut path_reports = Vec::new();
+    for (path, timing) in paths.iter().zip(timings) {
+        path_reports.push(PathReport {
+            path: path.name(),
+            seconds: timing.median_seconds,
+            speedup: plain.median_seconds / timing.median_seconds,
+            max_difference: difference(&picture(*path, &exact)?, &reference)?.0,
+            timing,
+        });
+    }
+    let exact_seconds = path_reports.first().map_or(0.0, |report| report.seconds);
+
+    let mut budgeted = Vec::new();
+    let exact_picture = picture(first, &exact)?;
+    for budget in budgets {
+        progress(&format!("budget {budget:.4}"));
+        budgeted.push(under_budget(&field, &camera, first, &exact, *budget, &exact_picture, repeats)?);
+    }
+    progress("discretisation");
+    let discretisation = discretisation(&field, &camera, first, &exact, repeats.min(3), progress)?;
+    let shape = generators::head_shape(&scene.generator.config().field);
+    let generators = generators::run(shape, field.volume_regions().len(), paths, repeats, &machine, progress)?;
+
+    let points = (exact.resolution * exact.resolution * exact.sampling.samples) as f64;
+    let operations = operations_per_point(&scene.generator.config().field, exact.normals);
+    let regions = field.volume_regions().len() as f64;
+    Ok(Report {
+        points_per_s: points / exact_seconds,
+        gflops: points * regions * operations / exact_seconds / 1e9,
+        peak_gflops: machine.peak_gflops(first),
+        plain_seconds: plain.median_seconds,
+        exact_seconds,
+        budgeted,
+        discretisation,
+        paths: path_reports,
+        generators,
+        scene: scene.describe(),
+        machine,
+    })
+}
+
+/// Operations at one point of one region for a picture, a multiply-add counting two; see [`generators::Work`].
+fn operations_per_point(field: &crate::config::FieldConfig, normals: bool) -> f64 {
+    let work = if normals { generators::Work::Gradient } else { generators::Work::Colour };
+    debug_assert_eq!(FILM_LAYERS, 5);
+    work.operations(&generators::head_shape(field))
+}
+
+/// The frame under `budget`, in turns with the exact one.
+fn under_budget(
+    field: &PortraitField,
+    camera: &Tensor,
+    path: Path,
+    exact: &RenderSettings,
+    budget: f64,
+    exact_picture: &Tensor,
+    repeats: usize,
+) -> Result<BudgetReport> {
+    let settings = RenderSettings { budget, ..exact.clone() };
+    let planned = path.run(|| plan::render(field, camera, &settings))?;
+    let way = |settings: &RenderSettings| -> Way<'_> {
+        let settings = settings.clone();
+        Box::new(move || path.run(|| plan::render(field, camera, &settings)).map(drop))
+    };
+    let timings = in_turns(repeats, &mut [way(&settings), way(exact)])?;
+    let (max_error, mean_error) = difference(&planned.frame.colour, exact_picture)?;
+    let (own, whole) = (timings[0].median_seconds, timings[1].median_seconds);
+    Ok(BudgetReport {
+        budget,
+        seconds: own,
+        speedup: whole / own,
+        max_error,
+        mean_error,
+        bound: planned.report.bound,
+        regions_evaluated: planned.report.pairs_evaluated,
+        samples_evaluated: planned.report.samples_evaluated,
+        shape_pairs_evaluated: planned.report.shape_pairs_evaluated,
+        pairs_skipped: planned.report.pairs_skipped,
+    })
+}
+
+/// Pictures of few samples against that of 1024, uniform and placed at the surface.
+fn discretisation(
+    field: &PortraitField,
+    camera: &Tensor,
+    path: Path,
+    exact: &RenderSettings,
+    repeats: usize,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Vec<DiscretisationReport>> {
+    // Colours alone: features and normals of 1024 samples would only take time.
+    let colours = RenderSettings { features: false, normals: false, ..exact.clone() };
+    let converged = path.run(|| plan::render(field, camera, &with_samples(&colours, CONVERGED_SAMPLES)))?.frame.colour;
+    let mut reports = Vec::new();
+    for samples in SAMPLES {
+        let colour_samples = (samples / COLOUR_SHARE).max(2);
+        let two_pass = TwoPass { bins: 4 * samples.max(12), colour_samples };
+        for (placement, two_pass, colour_samples) in
+            [("uniform", None, samples), ("surface", Some(two_pass), colour_samples)]
+        {
+            progress(&format!("{samples} samples, {placement}"));
+            let settings = RenderSettings { two_pass, ..with_samples(&colours, samples) };
+            let render = || path.run(|| plan::render(field, camera, &settings));
+            let picture = render()?.frame.colour;
+            let timing = in_turns(repeats, &mut [Box::new(|| render().map(drop))])?;
+            let psnr = quality::psnr(&picture, &converged)?.first().copied().unwrap_or_default();
+            let seconds = timing.first().map_or(0.0, |timing| timing.median_seconds);
+            reports.push(DiscretisationReport { samples, colour_samples, placement, seconds, psnr });
+        }
+    }
+    Ok(reports)
+}
+
+/// The charts' file names.
+pub const CHARTS: [&str; 4] = ["paths.svg", "budgets.svg", "discretisation.svg", "roofline.svg"];
+
+/// What a person looks at, in the order of [`CHARTS`].
+pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
+    let subtitle = format!("{} · {}", report.scene, report.machine.describe());
+    let caption = |title| Caption { title, subtitle: &subtitle };
+    let mut bars: Vec<_> = report.paths.iter().map(|path| (path.path.to_owned(), path.seconds)).collect();
+    bars.push(("candle's operations".to_owned(), report.plain_seconds));
+    let budgets = report.budgeted.iter().map(|budget| (format!("budget {:.4}", budget.budget), budget.seconds));
+    let groups = [
+        Group { label: "exact frame".into(), bars },
+        Group { label: "within a budget".into(), bars: budgets.collect() },
+    ];
+    let groups: Vec<_> = groups.into_iter().filter(|group| !group.bars.is_empty()).collect();
+    let paths = chart::bars(caption("A frame on every path"), "seconds; shorter is faster", &groups, &[])?;
+
+    let curve = |name: &str, value: &dyn Fn(&BudgetReport) -> f64| Curve {
+        name: name.into(),
+        points: report.budgeted.iter().map(|budget| (budget.seconds, value(budget))).collect(),
+        joined: true,
+        limit: false,
+    };
+    let mut lines = vec![
+        curve("largest error", &|budget| budget.max_error),
+        curve("mean error", &|budget| budget.mean_error),
+        curve("bound that the plan kept", &|budget| budget.bound),
+    ];
+    let most = report.budgeted.iter().map(|budget| budget.max_error.max(budget.bound)).fold(1e-2, f64::max);
+    let points = vec![(report.exact_seconds, 1e-6), (report.exact_seconds, most)];
+    lines.push(Curve { name: "the exact frame's time".into(), points, joined: true, limit: true });
+    let budgets = chart::curves(
+        caption("Time against error"),
+        Axis { label: "seconds a frame", logarithmic: true },
+        Axis { label: "difference from the exact frame, share of the colour range", logarithmic: true },
+        &lines,
+    )?;
+
+    let placed = |placement: &str, name: &str| Curve {
+        name: name.into(),
+        points: report
+            .discretisation
+            .iter()
+            .filter(|sum| sum.placement == placement)
+            .map(|sum| (sum.samples as f64, sum.psnr))
+            .collect(),
+        joined: true,
+        limit: false,
+    };
+    let ends = (SAMPLES[0] as f64, SAMPLES[SAMPLES.len() - 1] as f64);
+    let discretisation = chart::curves(
+        caption("Samples against the converged integral (1024 samples)"),
+        Axis { label: "samples a ray at which the distance is evaluated", logarithmic: true },
+        Axis { label: "PSNR, dB", logarithmic: false },
+        &[
+            placed("uniform", "uniform"),
+            placed("surface", "colours at the surface"),
+            Curve { name: "40 dB".into(), points: vec![(ends.0, 40.0), (ends.1, 40.0)], joined: true, limit: true },
+        ],
+    )?;
+    let roofline = generators::roofline(&report.generators, &report.machine)?;
+    Ok(CHARTS.into_iter().zip([paths, budgets, discretisation, roofline]).collect())
+}
