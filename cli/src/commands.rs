@@ -80,7 +80,7 @@ pub fn run(arguments: Arguments, console: &Console) -> anyhow::Result<Outcome> {
         Command::Render(render) => render.run(seed, console),
         Command::Export(export) => export.run(console),
         Command::Eval(eval) => eval.run(seed.unwrap_or(0), console),
-        Command::Bench(bench) => bench.run(console),
+        Command::Bench(bench) => bench.run(seed.unwrap_or(0), console),
         Command::Convert(convert) => convert.run(console),
         Command::Info(info) => info.run(console),
         Command::Completions(completions) => completions.run(),

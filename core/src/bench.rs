@@ -12,9 +12,12 @@ use crate::kernels::{Path, peak};
 
 pub mod chart;
 pub mod conv;
+pub mod edit;
 pub mod generators;
 pub mod measure;
+pub mod render;
 pub mod scene;
+pub mod sequence;
 pub mod stability;
 pub mod train;
 

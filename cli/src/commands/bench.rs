@@ -1,6 +1,10 @@
 //! `cnerf bench`: the suite's speed and exactness beside the plain path, in one run; `report.json` and charts.
 
 mod conv;
+mod edit;
+mod render;
+mod scene;
+mod sequence;
 mod stability;
 mod train;
 
@@ -19,6 +23,12 @@ use crate::{
 /// The subjects.
 #[derive(Subcommand, Debug)]
 pub enum BenchCommand {
+    /// One frame: exact on every kernel path, under budgets of error, and against the converged integral
+    Render(render::RenderArguments),
+    /// An orbit: exact frames, and frames over shared geometry
+    Sequence(sequence::SequenceArguments),
+    /// A view rendered again after an edit: whole, and only what the edit changed
+    Edit(edit::EditArguments),
     /// Convolutions of the networks' shapes, against candle's own
     Conv(conv::ConvArguments),
     /// Training steps: speed, memory and exact gradients, against candle's own operations
@@ -29,8 +39,11 @@ pub enum BenchCommand {
 
 impl BenchCommand {
     /// Measures one subject.
-    pub fn run(self, console: &Console) -> anyhow::Result<Outcome> {
+    pub fn run(self, seed: u64, console: &Console) -> anyhow::Result<Outcome> {
         match self {
+            Self::Render(render) => render.run(seed, console),
+            Self::Sequence(sequence) => sequence.run(seed, console),
+            Self::Edit(edit) => edit.run(seed, console),
             Self::Conv(conv) => conv.run(console),
             Self::Train(train) => train.run(console),
             Self::Stability(stability) => stability.run(console),
@@ -100,5 +113,13 @@ impl Common {
         let text = serde_json::to_string_pretty(report)?;
         picture::write_file(&self.out.join(REPORT), text.as_bytes())?;
         console.result(report, || format!("{}\n{}", summary(), self.out.join(REPORT).display()))
+    }
+}
+
+/// An error budget, [0, 1] colour units.
+fn parse_budget(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(budget) if (0.0..=1.0).contains(&budget) => Ok(budget),
+        _ => Err("must be a number between 0 and 1".into()),
     }
 }

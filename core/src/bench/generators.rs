@@ -44,7 +44,7 @@ impl Work {
     }
 
     /// Operations at one point of one region, a multiply-add counting two; sines are not counted.
-    fn operations(self, shape: &HeadShape) -> f64 {
+    pub(super) fn operations(self, shape: &HeadShape) -> f64 {
         let width = shape.width as f64;
         // A sweep back to the point through three layers, of which two are square.
         let sweep = |layers: f64| 2.0 * ((layers - 1.0) * width * width + 3.0 * width);

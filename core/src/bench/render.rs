@@ -14,7 +14,7 @@ use crate::{
     },
     error::{Error, Result},
     eval::quality,
-    kernels::{FILM_LAYERS, Path},
+    kernels::Path,
     model::field::PortraitField,
     render::{RadianceField as _, RenderSettings, TwoPass, plan},
 };
@@ -179,7 +179,6 @@ pub fn run(
 /// Operations at one point of one region for a picture, a multiply-add counting two; see [`generators::Work`].
 fn operations_per_point(field: &crate::config::FieldConfig, normals: bool) -> f64 {
     let work = if normals { generators::Work::Gradient } else { generators::Work::Colour };
-    debug_assert_eq!(FILM_LAYERS, 5);
     work.operations(&generators::head_shape(field))
 }
 

@@ -46,7 +46,7 @@ use self::{
 };
 use crate::{
     error::{Error, Result},
-    kernels::Outputs,
+    kernels::{Outputs, Path},
     region::{REGION_COUNT, RegionSet},
     render::{Frame, RadianceField, RayBundle, RenderSettings, frame},
 };
@@ -217,7 +217,7 @@ pub fn render<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSe
 /// The field of each picture as plain numbers; none if the pictures must be rendered exhaustively.
 fn fields<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Option<Vec<LocalField>>> {
     settings.validate()?;
-    let plain = matches!(cameras.device(), Device::Cpu) && cameras.dtype() == DType::F32;
+    let plain = matches!(cameras.device(), Device::Cpu) && cameras.dtype() == DType::F32 && !Path::is_composed()?;
     if settings.budget <= ROUNDING || settings.differentiable || settings.two_pass.is_some() || !plain {
         return Ok(None);
     }

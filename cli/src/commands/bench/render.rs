@@ -36,10 +36,9 @@ impl RenderArguments {
         let budgets = if self.budgets.is_empty() { BUDGETS.as_slice() } else { &self.budgets };
         let spinner = console.spinner("machine's peak");
         let machine = Machine::measure();
-        let report =
-            render::run(&scene, &paths, budgets, self.repeats.repeats.into(), machine, &mut |step| {
-                spinner.set_message(step.to_owned());
-            })?;
+        let report = render::run(&scene, &paths, budgets, self.repeats.repeats.into(), machine, &mut |step| {
+            spinner.set_message(step.to_owned());
+        })?;
         spinner.finish_and_clear();
         self.common.publish(console, &report, &render::charts(&report)?, || summary(&report))?;
         Ok(Outcome::Done)
@@ -65,8 +64,10 @@ fn summary(report: &Report) -> String {
             budget.budget, budget.seconds, budget.speedup, budget.max_error, budget.bound
         )
     }));
-    lines.extend(report.discretisation.iter().map(|sum| {
-        format!("{} samples, {}: {:.1} dB in {:.4} s", sum.samples, sum.placement, sum.psnr, sum.seconds)
-    }));
+    lines.extend(
+        report.discretisation.iter().map(|sum| {
+            format!("{} samples, {}: {:.1} dB in {:.4} s", sum.samples, sum.placement, sum.psnr, sum.seconds)
+        }),
+    );
     lines.join("\n")
 }
