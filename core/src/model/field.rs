@@ -414,7 +414,9 @@ impl RadianceField for PortraitField {
             return Ok((softplus / scale)?);
         }
         let inverse = bounded(&self.log_alpha)?.neg()?.exp()?;
-        Ok(sigmoid(&distance.neg()?.broadcast_mul(&inverse)?)?.broadcast_mul(&inverse)?)
+        // Not a sigmoid, whose slope s (1 − s) cancels deep inside. Beyond 80 α the density is below 1e-33 / α.
+        let outward = distance.broadcast_mul(&inverse)?.minimum(80.0)?.exp()?;
+        Ok((outward + 1.0)?.recip()?.broadcast_mul(&inverse)?)
     }
 
     fn background(

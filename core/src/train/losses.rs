@@ -42,9 +42,11 @@ const OPACITY_MARGIN: f64 = 1e-4;
 /// both in [0, 1].
 pub fn opacity(predicted: &Tensor, target: &Tensor) -> Result<Tensor> {
     check_same("target opacity", predicted, target)?;
-    let covered = predicted.maximum(OPACITY_MARGIN)?.minimum(1.0 - OPACITY_MARGIN)?;
+    let bounded = |share: &Tensor| share.maximum(OPACITY_MARGIN)?.minimum(1.0 - OPACITY_MARGIN);
+    // Each share is bounded on its own: 1 − (1 − margin) would have lost the margin's digits to rounding.
+    let (covered, clear) = (bounded(predicted)?, bounded(&predicted.affine(-1.0, 1.0)?)?);
     let open = target.affine(-1.0, 1.0)?;
-    let likelihood = ((target * covered.log()?)? + (open * covered.affine(-1.0, 1.0)?.log()?)?)?;
+    let likelihood = ((target * covered.log()?)? + (open * clear.log()?)?)?;
     Ok(likelihood.neg()?.mean_all()?)
 }
 
