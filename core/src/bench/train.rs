@@ -102,15 +102,15 @@ impl Sizes {
     }
 
     /// About how much memory a step takes as candle's graph, bytes: every operation keeps its result until the backward
-    /// pass, of which there are about three for each layer and region, and as many again for ∇d.
+    /// pass. In tensors of all points, regions and units: measured at small sizes.
     pub fn composed_bytes(&self, step: Step) -> f64 {
         let points = (self.batch * self.resolution * self.resolution * self.samples) as f64;
         let width = self.config().model.field.width as f64;
         let tensor = points * REGION_COUNT as f64 * width * 4.0;
         match step {
-            Step::Pivot => 16.0 * tensor,
+            Step::Pivot => 30.0 * tensor,
             // One render with ∇d, and four for L_STD.
-            Step::Generator | Step::Training => (32.0 + 4.0 * 16.0) * tensor,
+            Step::Generator | Step::Training => 120.0 * tensor,
         }
     }
 }

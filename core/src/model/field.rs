@@ -5,7 +5,6 @@
 //! generators' raw outputs come from the kernels, this file fuses them.
 
 use candle_core::{DType, Tensor};
-use candle_nn::ops::sigmoid;
 
 use crate::{
     camera::INPUT_SCALE,

@@ -1,9 +1,11 @@
 //! Which portrait is rendered, how large.
 
+use candle_core::Device;
 use clap::Args;
-use cnerf_core::bench::scene::{Scene, SceneKind};
-
-use crate::options::ModelOptions;
+use cnerf_core::{
+    bench::scene::{Scene, SceneKind},
+    model::generator::Generator,
+};
 
 /// The model whose portrait is measured by default.
 const DEFAULT_MODEL: &str = "portrait";
@@ -34,9 +36,13 @@ impl SceneArguments {
             }
             SceneKind::Reference => Scene::reference(seed)?,
             SceneKind::Model => {
-                let options = ModelOptions { model: self.model.clone(), device: "cpu".into() };
                 let name = self.model.as_deref().unwrap_or(DEFAULT_MODEL);
-                Scene::of_model(options.load_or(DEFAULT_MODEL)?, name, seed)?
+                // The kernels under test are the processor's, so there is no choice of device.
+                let generator = match cnerf_models::bytes(name) {
+                    Some(bytes) => Generator::from_bytes(name.as_ref(), bytes, &Device::Cpu)?,
+                    None => Generator::open(name.as_ref(), &Device::Cpu)?,
+                };
+                Scene::of_model(generator, name, seed)?
             }
         };
         Ok(scene.resized(self.resolution.map(usize::from), self.samples.map(usize::from))?)
