@@ -71,7 +71,7 @@ pub fn bars(caption: Caption<'_>, unit: &str, groups: &[Group], limits: &[(Strin
     let values = groups.iter().flat_map(|group| &group.bars).map(|(_, value)| *value);
     let largest =
         values.chain(limits.iter().map(|limit| limit.1)).filter(|value| value.is_finite()).fold(0.0, f64::max);
-    let most = if largest > 0.0 { 1.18 * largest } else { 1.0 };
+    let most = if largest > 0.0 { 1.4 * largest } else { 1.0 };
     let mut names: Vec<&str> = Vec::new();
     for (name, _) in groups.iter().flat_map(|group| &group.bars) {
         if !names.contains(&name.as_str()) {
@@ -197,7 +197,7 @@ pub fn curves(caption: Caption<'_>, x: Axis<'_>, y: Axis<'_>, curves: &[Curve]) 
         }
         chart
             .configure_series_labels()
-            .position(SeriesLabelPosition::UpperRight)
+            .position(SeriesLabelPosition::LowerRight)
             .background_style(WHITE.mix(0.85))
             .border_style(RGBColor(190, 190, 190))
             .label_font((FONT, 13))
