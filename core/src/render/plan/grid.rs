@@ -169,9 +169,9 @@ impl Grid {
         let strides = self.strides();
         (0..8).map(move |corner: usize| {
             let (mut vertex, mut share) = (place.vertex, 1.0);
-            for axis in 0..3 {
+            for (axis, stride) in strides.into_iter().enumerate() {
                 if corner >> axis & 1 == 1 {
-                    vertex += strides[axis];
+                    vertex += stride;
                     share *= place.fraction[axis];
                 } else {
                     share *= 1.0 - place.fraction[axis];
@@ -326,7 +326,7 @@ mod tests {
         generator.field().portraits(&codes).unwrap().local(0).unwrap().unwrap()
     }
 
-    /// Proven radii of a region's raw mask and residual over the ball-free box centre ± half (network units): an affine
+    /// Proven radii of a region's raw mask and residual over the box centre ± half (network units): an affine
     /// form in the three coordinates is carried through the layers, sin(m + t) = sin m + t cos m ± t²/2 where that is
     /// tighter than ± 1.
     fn proven_radii(field: &LocalField, region: usize, centre: [f64; 3], half: f64) -> [f64; 2] {
@@ -343,14 +343,13 @@ mod tests {
                 let weight = gamma * f64::from(*weight);
                 value += weight * values[input];
                 error += weight.abs() * errors[input];
-                for axis in 0..3 {
-                    slope[axis] += weight * slopes[input][axis];
+                for (slope, own) in slope.iter_mut().zip(slopes[input]) {
+                    *slope += weight * own;
                 }
             }
             (value, slope, error)
         };
-        for layer in 0..SHAPE_LAYERS {
-            let linear = &layout.layers[layer];
+        for (layer, linear) in layout.layers.iter().enumerate().take(SHAPE_LAYERS) {
             let mut next = (Vec::new(), Vec::new(), Vec::new());
             for unit in 0..width {
                 let gamma = f64::from(film[2 * layer * width + unit]);

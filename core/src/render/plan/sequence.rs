@@ -208,8 +208,8 @@ impl Shared {
         }
         for ray in 0..rays.count() {
             let mut light = Light::default();
-            let mut end = marched.marched[ray] as usize;
-            for step in 0..end {
+            let reached = marched.marched[ray] as usize;
+            for step in 0..reached {
                 let sample = ray * samples + step;
                 let takes_all = rays.closed && step + 1 == samples;
                 if interpolated[sample] {
@@ -231,12 +231,12 @@ impl Shared {
                 }
                 let left = if takes_all { 0.0 } else { light.left() };
                 marched.remaining[ray] = left;
-                if left <= cut && step + 1 < end {
-                    end = step + 1;
-                    marched.marched[ray] = end as u32;
+                if left <= cut && step + 1 < reached {
+                    marched.marched[ray] = step as u32 + 1;
                     break;
                 }
             }
+            let end = marched.marched[ray] as usize;
             if end < samples || marched.remaining[ray] <= cut {
                 let left = std::mem::take(&mut marched.remaining[ray]);
                 marched.weights[ray * samples + end - 1] += left;
@@ -287,9 +287,9 @@ impl Shared {
         let mut state = ChunkState::new(&self.ready, rays.depths.len());
         let mut marched = Marched::new(&rays, regions);
         let (mut lit, mut wanted) = (Vec::new(), Vec::new());
-        for ray in 0..rays.count() {
-            let share = (1.0 - remaining[ray]) / samples as f32;
-            marched.remaining[ray] = remaining[ray];
+        for (ray, remaining) in remaining.into_iter().enumerate() {
+            let share = (1.0 - remaining) / samples as f32;
+            marched.remaining[ray] = remaining;
             marched.marched[ray] = samples as u32;
             // A pixel without light needs no sample.
             if share * samples as f32 <= (settings.budget * CUT_SHARE) as f32 {

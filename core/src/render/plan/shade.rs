@@ -91,7 +91,8 @@ pub fn shade(
         let mut masks = [0f32; REGION_COUNT];
         let mut colour = [0f32; 3];
         let mut depth = 0.0;
-        for sample in ray * rays.samples..ray * rays.samples + marched.marched[ray] as usize {
+        let samples = logits.iter().enumerate().skip(ray * rays.samples).take(marched.marched[ray] as usize);
+        for (sample, logits) in samples {
             let weight = marched.weights[sample];
             if weight == 0.0 {
                 continue;
@@ -105,7 +106,7 @@ pub fn shade(
             for (row, mask) in field.rows().zip(sample_masks) {
                 masks[row] += weight * mask;
             }
-            let own = doubts.colour(&logits[sample], sample_masks, selection.left_out[sample]);
+            let own = doubts.colour(logits, sample_masks, selection.left_out[sample]);
             add_scaled(&mut colour, weight, &own);
         }
         for region in Region::ALL.iter().filter(|region| !shown.regions.contains(**region)) {
