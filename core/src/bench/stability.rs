@@ -25,7 +25,7 @@ mod networks;
 
 /// Roundings that pile up in the longest sums here (thousands of terms, five layers), in units of what moving every input
 /// by one rounding does.
-pub const STABILITY: f64 = 32.0;
+pub const STABILITY: f64 = 64.0;
 /// What is left to f32 where moving inputs changes nothing: 32 units of rounding.
 pub const ROUNDING: f64 = 32.0 * UNIT;
 /// Sums up to this many terms are within [`ROUNDING`]; roundings of longer ones add up as the root of their number.
