@@ -1,7 +1,7 @@
 //! Seeded draws for the tests.
 
 use candle_core::{Device, Tensor};
-use rand::{Rng as _, RngExt as _, SeedableRng as _};
+use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use crate::Result;
@@ -14,21 +14,6 @@ impl Stream {
     pub fn new(seed: u64, path: &[u64]) -> Self {
         let word = path.iter().fold(seed, |state, word| state.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(*word));
         Self(ChaCha8Rng::seed_from_u64(word))
-    }
-
-    /// 64 random bits.
-    pub fn bits(&mut self) -> u64 {
-        self.0.next_u64()
-    }
-
-    /// Uniform in [0, 1).
-    pub fn uniform(&mut self) -> f32 {
-        self.0.random::<f32>()
-    }
-
-    /// Uniform in [low, high).
-    pub fn range(&mut self, low: f32, high: f32) -> f32 {
-        low + (high - low) * self.uniform()
     }
 
     /// Uniform integer in [0, count).

@@ -96,12 +96,15 @@ fn cases() -> Vec<Case> {
 /// The named results of one computation.
 type Outputs = Vec<(&'static str, Tensor)>;
 
+/// What a case computes, in whichever precision its inputs come.
+type Computation = dyn Fn(&mut Inputs) -> Result<Outputs>;
+
 /// Something computed from [`Inputs`] in whatever precision they have.
 struct Case {
     name: String,
     /// Terms of its longest sum.
     terms: usize,
-    compute: Box<dyn Fn(&mut Inputs) -> Result<Outputs>>,
+    compute: Box<Computation>,
 }
 
 impl Case {
@@ -299,7 +302,7 @@ mod tests {
             Ok(vec![("root", x.sqrt()?)])
         });
         let coarse = coarse.run(&[Path::Composed]).unwrap();
-        assert!(coarse.finite && !coarse.passed && coarse.quantity == "rounded", "{coarse:?}");
+        assert!(coarse.finite && !coarse.passed, "{coarse:?}");
         let infinite = infinite.run(&[Path::Composed]).unwrap();
         assert!(!infinite.finite && !infinite.passed, "{infinite:?}");
     }

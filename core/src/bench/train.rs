@@ -262,7 +262,9 @@ impl Pivot {
 
         let resolution = self.sizes.resolution;
         let chosen: Vec<u32> = (0..resolution * resolution)
-            .filter(|pixel| (pixel % resolution) % self.stride == 0 && (pixel / resolution) % self.stride == 0)
+            .filter(|pixel| {
+                (pixel % resolution).is_multiple_of(self.stride) && (pixel / resolution).is_multiple_of(self.stride)
+            })
             .map(|pixel| pixel as u32)
             .collect();
         let count = chosen.len();
@@ -315,7 +317,9 @@ pub fn exactness(sizes: &Sizes, fused: Path) -> Result<Exactness> {
 /// What `stage` measures in each of its first `steps` steps on `path`, from the same start and the same draws on any path.
 pub fn trajectory(preset: Preset, stage: Stage, steps: usize, path: Path) -> Result<Vec<Metrics>> {
     let config = TrainConfig::preset(preset);
-    let portraits = Portraits::draw(config.warmup.batch.max(2 * config.field.batch), 64)?;
+    // First codes are principal components: they need more portraits than they have numbers.
+    let count = config.warmup.batch.max(2 * config.field.batch).max(config.model.field.style_dim + 1);
+    let portraits = Portraits::draw(count, 64)?;
     let inputs = portraits.inputs();
     path.run(|| {
         let mut run: Box<dyn StageRun> = match stage {

@@ -291,7 +291,7 @@ impl TrainConfig {
                 schedule: Schedule { warmup_steps: 50, hold: 0.4, floor: 0.05 },
                 betas: [0.9, 0.99],
                 pixels: 1.0,
-                perceptual: 0.5,
+                perceptual: 0.15,
                 perceptual_zoom: 2.0,
                 adversarial: 0.0,
                 channel_multiplier: 0.125,

@@ -81,7 +81,7 @@ impl Scene {
         // An untrained field's masks and residuals hardly differ from nothing; these do.
         for suffix in ["mask.weight", "residual.weight", "colour.weight"] {
             if let Some(weight) = weights.get_mut(suffix) {
-                *weight = (weight.as_ref() * 8.0)?;
+                *weight = (&*weight * 8.0)?;
             }
         }
         if let Some(log_alpha) = self.log_alpha {
@@ -162,7 +162,7 @@ fn denormal(weights: &mut Tensors) -> Result<()> {
 fn scale(weights: &mut Tensors, factor: f64) -> Result<()> {
     for (name, weight) in weights.iter_mut() {
         if !name.ends_with("log_alpha") {
-            *weight = (weight.as_ref() * factor)?;
+            *weight = (&*weight * factor)?;
         }
     }
     Ok(())

@@ -157,7 +157,7 @@ impl Judge {
 
 fn scale(weights: &mut Tensors, factor: f64) -> Result<()> {
     for weight in weights.values_mut() {
-        *weight = (weight.as_ref() * factor)?;
+        *weight = (&*weight * factor)?;
     }
     Ok(())
 }
