@@ -13,9 +13,9 @@ use cnerf_core::{
     camera::Camera,
     codes::{self, Aspect},
     data::{labels::LabelMap, picture},
-    eval::quality,
+    eval::locality::EditChange,
     model::generator::{Generator, Picture},
-    region::{Region, RegionSet},
+    region::RegionSet,
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -28,7 +28,6 @@ pub use self::{
 use crate::{
     error::{Error, Result},
     inverter::{Opened, one_picture},
-    objective,
     portrait::{EditRecord, Portrait, Undo},
 };
 
@@ -261,29 +260,10 @@ impl Edit {
 /// Colour change where `regions` were or are (argmax masks, grown by a pixel: a picture's edges are a pixel wide) and
 /// elsewhere, and depth change.
 fn measure(before: &Picture, after: &Picture, regions: RegionSet) -> Result<Change> {
-    let (old, new) =
-        (LabelMap::from_masks(&before.masks.squeeze(0)?)?, LabelMap::from_masks(&after.masks.squeeze(0)?)?);
-    let (width, height) = (old.width() as usize, old.height() as usize);
-    let shown = |labels: &LabelMap, index: usize| {
-        let region = labels.labels().get(index).copied().and_then(Region::from_label);
-        region.is_some_and(|region| regions.contains(region))
-    };
-    let inside: Vec<bool> = (0..width * height).map(|index| shown(&old, index) || shown(&new, index)).collect();
-    let grown: Vec<f32> = (0..width * height)
-        .map(|index| {
-            let (x, y) = (index % width, index / width);
-            let mut near = (y.saturating_sub(1)..(y + 2).min(height))
-                .flat_map(|row| (x.saturating_sub(1)..(x + 2).min(width)).map(move |column| row * width + column));
-            f32::from(u8::from(near.any(|index| inside.get(index).copied().unwrap_or(false))))
-        })
-        .collect();
-    let mask = Tensor::from_vec(grown, (1, 1, height, width), before.rgb.device())?;
-    let [before_rgb, after_rgb] = [before.rgb.clamp(-1.0, 1.0)?, after.rgb.clamp(-1.0, 1.0)?];
-    let change = quality::change(&before_rgb, &after_rgb, &mask)?.into_iter().next();
-    let depth = (&before.frame.depth - &after.frame.depth)?.abs()?.mean_all()?;
+    let change = EditChange::between(before, after, regions)?;
     Ok(Change {
-        inside_change: change.and_then(|change| change.inside).unwrap_or(0.0),
-        outside_change: change.and_then(|change| change.outside).unwrap_or(0.0),
-        depth_change: objective::scalar(&depth)?,
+        inside_change: change.inside.unwrap_or(0.0),
+        outside_change: change.outside.unwrap_or(0.0),
+        depth_change: change.depth,
     })
 }
