@@ -1,7 +1,7 @@
 //! How fast and how right the suite is, measured side by side: every fast way against the plain one, both interleaved
 //! in one run on one machine, beside what that machine could do at most.
 //!
-//! Each subject gives a serialisable report and the [`chart`]s a person would look at; `cnerf bench` writes both.
+//! Each subject gives a serialisable report and the charts a person would look at; `cnerf bench` writes both.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,6 @@ use serde::Serialize;
 
 use crate::kernels::{Path, peak};
 
-pub mod chart;
 pub mod conv;
 pub mod edit;
 pub mod generators;

@@ -6,10 +6,10 @@ use serde::Serialize;
 use crate::{
     bench::{
         Machine,
-        chart::{self, Caption, Group},
         measure::{Way, in_turns},
     },
     error::Result,
+    interop::chart::{Group, GroupedBars},
     kernels::{Path, conv},
     rng::Stream,
 };
@@ -173,8 +173,14 @@ pub fn chart(rows: &[Row], machine: &Machine) -> Result<String> {
     }
     let used = machine.peaks.iter().filter(|peak| rows.iter().any(|row| row.path == peak.name));
     let limits: Vec<_> = used.map(|peak| (format!("{} peak", peak.name), peak.gflops)).collect();
-    let caption = Caption { title: "Convolutions, batch 1", subtitle: &machine.describe() };
-    chart::bars(caption, "10⁹ operations a second; longer is faster", &groups, &limits)
+    GroupedBars {
+        title: "Convolutions, batch 1",
+        subtitle: &machine.describe(),
+        unit: "10⁹ operations a second; longer is faster",
+        groups: &groups,
+        limits: &limits,
+    }
+    .svg()
 }
 
 #[cfg(test)]

@@ -6,12 +6,12 @@ use serde::Serialize;
 use crate::{
     bench::{
         Machine,
-        chart::{self, Caption, Group},
         measure::{Timing, Way, in_turns},
         scene::{Scene, difference},
     },
     codes::{self, Aspect},
     error::Result,
+    interop::chart::{Group, GroupedBars},
     kernels::Path,
     region::{Region, RegionSet},
     render::{
@@ -157,5 +157,12 @@ pub fn chart(report: &Report) -> Result<String> {
         ],
     };
     let groups: Vec<_> = report.edits.iter().map(group).collect();
-    chart::bars(Caption { title: &title, subtitle: &subtitle }, "seconds a frame; shorter is faster", &groups, &[])
+    GroupedBars {
+        title: &title,
+        subtitle: &subtitle,
+        unit: "seconds a frame; shorter is faster",
+        groups: &groups,
+        limits: &[],
+    }
+    .svg()
 }

@@ -5,10 +5,10 @@ use serde::Serialize;
 use crate::{
     bench::{
         Machine,
-        chart::{self, Axis, Caption, Curve},
         measure::{Way, in_turns},
     },
     error::Result,
+    interop::chart::{Axis, LineChart, Mark, Series},
     kernels::{self, Evaluation, Extent, FILM_LAYERS, Gradients, HeadShape, Outputs, Path},
     rng::Stream,
 };
@@ -164,13 +164,13 @@ fn kernel(path: Path) -> Option<&'static dyn kernels::RegionKernel<f32>> {
 
 /// The roofline: speed over operations per byte, under the ceilings of arithmetic and memory.
 pub fn roofline(speeds: &[Speed], machine: &Machine) -> Result<String> {
-    let mut curves: Vec<Curve> = Vec::new();
+    let mut series: Vec<Series> = Vec::new();
     for speed in speeds {
         let point = (speed.operations_per_byte, speed.gflops);
-        match curves.iter_mut().find(|curve| curve.name == speed.path) {
-            Some(curve) => curve.points.push(point),
+        match series.iter_mut().find(|series| series.name == speed.path) {
+            Some(series) => series.points.push(point),
             None => {
-                curves.push(Curve { name: speed.path.to_owned(), points: vec![point], joined: false, limit: false });
+                series.push(Series { name: speed.path.to_owned(), points: vec![point], mark: Mark::Dots });
             }
         }
     }
@@ -179,15 +179,16 @@ pub fn roofline(speeds: &[Speed], machine: &Machine) -> Result<String> {
         let knee = peak.gflops / machine.memory_gigabytes_per_second;
         let points = vec![(0.25, 0.25 * machine.memory_gigabytes_per_second), (knee, peak.gflops), (most, peak.gflops)];
         let name = format!("ceiling, {} and {:.0} GB/s memory", peak.name, machine.memory_gigabytes_per_second);
-        curves.push(Curve { name, points, joined: true, limit: true });
+        series.push(Series { name, points, mark: Mark::Limit });
     }
-    let caption = Caption { title: "Local generators: shape, colour, ∇, backward", subtitle: &machine.describe() };
-    chart::curves(
-        caption,
-        Axis { label: "operations for each byte that passes memory", logarithmic: true },
-        Axis { label: "10⁹ operations a second", logarithmic: true },
-        &curves,
-    )
+    LineChart {
+        title: "Local generators: shape, colour, ∇, backward".into(),
+        subtitle: machine.describe(),
+        x: Axis::logarithmic("operations for each byte that passes memory"),
+        y: Axis::logarithmic("10⁹ operations a second"),
+        series,
+    }
+    .svg()
 }
 
 /// The heads of a field's local generators.

@@ -7,13 +7,13 @@ use serde::Serialize;
 use crate::{
     bench::{
         Machine,
-        chart::{self, Axis, Caption, Curve, Group},
         generators::{self, Speed},
         measure::{Timing, Way, in_turns},
         scene::{Scene, difference, with_samples},
     },
     error::{Error, Result},
     eval::quality,
+    interop::chart::{Axis, Group, GroupedBars, LineChart, Mark, Series},
     kernels::Path,
     model::field::PortraitField,
     render::{RadianceField as _, RenderSettings, TwoPass, plan},
@@ -253,7 +253,6 @@ pub const CHARTS: [&str; 4] = ["paths.svg", "budgets.svg", "discretisation.svg",
 /// What a person looks at, in the order of [`CHARTS`].
 pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
     let subtitle = format!("{} · {}", report.scene, report.machine.describe());
-    let caption = |title| Caption { title, subtitle: &subtitle };
     let mut bars: Vec<_> = report.paths.iter().map(|path| (path.path.to_owned(), path.seconds)).collect();
     bars.push(("candle's operations".to_owned(), report.plain_seconds));
     let budgets = report.budgeted.iter().map(|budget| (format!("budget {:.4}", budget.budget), budget.seconds));
@@ -262,13 +261,19 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
         Group { label: "within a budget".into(), bars: budgets.collect() },
     ];
     let groups: Vec<_> = groups.into_iter().filter(|group| !group.bars.is_empty()).collect();
-    let paths = chart::bars(caption("A frame on every path"), "seconds; shorter is faster", &groups, &[])?;
+    let paths = GroupedBars {
+        title: "A frame on every path",
+        subtitle: &subtitle,
+        unit: "seconds; shorter is faster",
+        groups: &groups,
+        limits: &[],
+    }
+    .svg()?;
 
-    let curve = |name: &str, value: &dyn Fn(&BudgetReport) -> f64| Curve {
-        name: name.into(),
-        points: report.budgeted.iter().map(|budget| (budget.seconds, value(budget))).collect(),
-        joined: true,
-        limit: false,
+    let curve = |name: &str, value: &dyn Fn(&BudgetReport) -> f64| {
+        let mut points: Vec<_> = report.budgeted.iter().map(|budget| (budget.seconds, value(budget))).collect();
+        points.sort_by(|left, right| left.0.total_cmp(&right.0));
+        Series { name: name.into(), points, mark: Mark::LineAndDots }
     };
     let mut lines = vec![
         curve("largest error", &|budget| budget.max_error),
@@ -277,15 +282,17 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
     ];
     let most = report.budgeted.iter().map(|budget| budget.max_error.max(budget.bound)).fold(1e-2, f64::max);
     let points = vec![(report.exact_seconds, 1e-6), (report.exact_seconds, most)];
-    lines.push(Curve { name: "the exact frame's time".into(), points, joined: true, limit: true });
-    let budgets = chart::curves(
-        caption("Time against error"),
-        Axis { label: "seconds a frame", logarithmic: true },
-        Axis { label: "difference from the exact frame, share of the colour range", logarithmic: true },
-        &lines,
-    )?;
+    lines.push(Series { name: "the exact frame's time".into(), points, mark: Mark::Limit });
+    let budgets = LineChart {
+        title: "Time against error".into(),
+        subtitle: subtitle.clone(),
+        x: Axis::logarithmic("seconds a frame"),
+        y: Axis::logarithmic("difference from the exact frame, share of the colour range"),
+        series: lines,
+    }
+    .svg()?;
 
-    let placed = |placement: &str, name: &str| Curve {
+    let placed = |placement: &str, name: &str| Series {
         name: name.into(),
         points: report
             .discretisation
@@ -293,20 +300,21 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
             .filter(|sum| sum.placement == placement)
             .map(|sum| (sum.samples as f64, sum.psnr))
             .collect(),
-        joined: true,
-        limit: false,
+        mark: Mark::LineAndDots,
     };
     let ends = (SAMPLES[0] as f64, SAMPLES[SAMPLES.len() - 1] as f64);
-    let discretisation = chart::curves(
-        caption("Samples against the converged integral (1024 samples)"),
-        Axis { label: "samples a ray at which the distance is evaluated", logarithmic: true },
-        Axis { label: "PSNR, dB", logarithmic: false },
-        &[
+    let discretisation = LineChart {
+        title: "Samples against the converged integral (1024 samples)".into(),
+        subtitle,
+        x: Axis::logarithmic("samples a ray at which the distance is evaluated"),
+        y: Axis::linear("PSNR, dB"),
+        series: vec![
             placed("uniform", "uniform"),
             placed("surface", "colours at the surface"),
-            Curve { name: "40 dB".into(), points: vec![(ends.0, 40.0), (ends.1, 40.0)], joined: true, limit: true },
+            Series { name: "40 dB".into(), points: vec![(ends.0, 40.0), (ends.1, 40.0)], mark: Mark::Limit },
         ],
-    )?;
+    }
+    .svg()?;
     let roofline = generators::roofline(&report.generators, &report.machine)?;
     Ok(CHARTS.into_iter().zip([paths, budgets, discretisation, roofline]).collect())
 }

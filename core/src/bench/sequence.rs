@@ -7,12 +7,12 @@ use serde::Serialize;
 use crate::{
     bench::{
         Machine,
-        chart::{self, Caption, Group},
         measure::Timing,
         scene::{Scene, difference},
     },
     camera::Camera,
     error::Result,
+    interop::chart::{Group, GroupedBars},
     kernels::Path,
     render::{
         RadianceField as _, RenderSettings,
@@ -139,5 +139,12 @@ pub fn chart(report: &Report) -> Result<String> {
         ("over shared geometry, its making included".to_owned(), report.shared_seconds_per_frame),
     ];
     let groups = [Group { label: format!("a frame ({})", report.path), bars }];
-    chart::bars(Caption { title: &title, subtitle: &subtitle }, "seconds a frame; shorter is faster", &groups, &[])
+    GroupedBars {
+        title: &title,
+        subtitle: &subtitle,
+        unit: "seconds a frame; shorter is faster",
+        groups: &groups,
+        limits: &[],
+    }
+    .svg()
 }

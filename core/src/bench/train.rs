@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 use crate::{
     bench::{
         Machine,
-        chart::{self, Caption, Group},
         measure::{Timing, Way, in_turns, relative_l2},
     },
     camera::{self, Camera},
@@ -21,6 +20,7 @@ use crate::{
         picture::RgbImage,
     },
     error::{Error, Result},
+    interop::chart::{Group, GroupedBars},
     kernels::{Outputs, Path},
     model::field::Field,
     parameters::Parameters,
@@ -369,7 +369,6 @@ pub fn charts(
     let subtitle =
         format!("{} · {resolution}×{resolution} rays of {samples} samples, batch {batch}", machine.describe());
     let title = format!("Training steps, {preset:?} networks");
-    let caption = Caption { title: &title, subtitle: &subtitle };
     let group = |step: &StepReport, fused_value: Option<f64>, plain_value: Option<f64>| {
         let fused_bar = fused_value.map(|value| (format!("fused ({})", fused.name()), value));
         let plain_bar = plain_value.map(|value| ("candle's operations".to_owned(), value));
@@ -382,9 +381,12 @@ pub fn charts(
         .collect();
     let memory: Vec<_> =
         steps.iter().map(|step| group(step, gib(step.peak_rss_bytes), gib(step.plain_peak_rss_bytes))).collect();
+    let bars = |unit: &str, groups: &[Group]| {
+        GroupedBars { title: &title, subtitle: &subtitle, unit, groups, limits: &[] }.svg()
+    };
     Ok(vec![
-        (CHARTS[0], chart::bars(caption, "seconds an image; shorter is faster", &seconds, &[])?),
-        (CHARTS[1], chart::bars(caption, "GiB a process of its own held at most", &memory, &[])?),
+        (CHARTS[0], bars("seconds an image; shorter is faster", &seconds)?),
+        (CHARTS[1], bars("GiB a process of its own held at most", &memory)?),
     ])
 }
 

@@ -1,6 +1,8 @@
 //! Charts of measurements as SVG files: lines over a number, bars over names, histograms. Every axis has a title with
 //! its unit; colours are told apart by colour-blind people too (Okabe and Ito, 2008).
 
+mod grouped;
+
 use std::{ops::Range, path::Path};
 
 use plotters::{
@@ -8,16 +10,21 @@ use plotters::{
         Shift,
         ranged1d::{DefaultFormatting, KeyPointHint, Ranged},
     },
+    element::DashedPathElement,
     prelude::*,
 };
+
+pub use self::grouped::{Group, GroupedBars};
 
 use crate::{
     data::picture,
     error::{Error, Result},
 };
 
-/// Width and height of a chart, pixels.
-const SIZE: (u32, u32) = (900, 540);
+/// Width of a chart, pixels.
+const WIDTH: u32 = 900;
+/// Height of a chart of two axes, pixels.
+const HEIGHT: u32 = 540;
 const FONT: &str = "sans-serif";
 const PALETTE: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
@@ -28,6 +35,8 @@ const PALETTE: [RGBColor; 7] = [
     RGBColor(86, 180, 233),
     RGBColor(90, 90, 90),
 ];
+/// Of bounds and ceilings.
+const LIMIT_COLOUR: RGBColor = RGBColor(90, 90, 90);
 /// Share of a chart's height that is kept free for its legend.
 const LEGEND_ROOM: f64 = 0.18;
 /// Axes aim at this many ticks.
@@ -151,6 +160,20 @@ fn number(value: f64) -> String {
     if size != 0.0 && !(1e-4..1e6).contains(&size) { format!("{value:.1e}") } else { format!("{rounded}") }
 }
 
+/// How a series is drawn.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Mark {
+    /// A line through the points.
+    #[default]
+    Line,
+    /// A line, and a dot at each point: for few, measured points.
+    LineAndDots,
+    /// Dots alone.
+    Dots,
+    /// A dashed line: a bound or a ceiling.
+    Limit,
+}
+
 /// A named line.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Series {
@@ -158,8 +181,8 @@ pub struct Series {
     pub name: String,
     /// In drawing order; points that are not finite are left out.
     pub points: Vec<(f64, f64)>,
-    /// Whether each point has a dot: for few, measured points.
-    pub dots: bool,
+    /// How they are drawn.
+    pub mark: Mark,
 }
 
 /// Lines over a number.
@@ -167,6 +190,8 @@ pub struct Series {
 pub struct LineChart {
     /// Above the chart.
     pub title: String,
+    /// Under the title: where and with what it was measured. May be empty.
+    pub subtitle: String,
     /// Across.
     pub x: Axis,
     /// Upwards.
@@ -192,21 +217,32 @@ impl LineChart {
         let x = self.x.ruler(lines.iter().flatten().map(|point| point.0));
         let named = self.series.iter().any(|series| !series.name.is_empty());
         let y = self.y.ruler(lines.iter().flatten().map(|point| point.1)).below_legend(named);
-        draw(|area| {
-            let mut chart = frame(area, &self.title, (&x, &y))?;
+        draw(HEIGHT, (&self.title, &self.subtitle), |area| {
+            let mut chart = frame(area, (&x, &y))?;
             mesh(&mut chart, (&self.x.title, &|place| self.x.label(*place)), (&self.y, &|place| self.y.label(*place)))?;
             for (index, (series, line)) in self.series.iter().zip(&lines).enumerate() {
-                let colour = colour(index);
-                let drawn = chart.draw_series(LineSeries::new(line.iter().copied(), colour.stroke_width(2)));
-                let drawn = drawn.map_err(fault)?;
-                if !series.name.is_empty() {
-                    drawn
-                        .label(&series.name)
-                        .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], colour.stroke_width(3)));
+                let colour = if series.mark == Mark::Limit { LIMIT_COLOUR } else { colour(index) };
+                let stroke = colour.stroke_width(2);
+                let drawn = match series.mark {
+                    Mark::Line | Mark::LineAndDots => {
+                        chart.draw_series(LineSeries::new(line.iter().copied(), stroke)).map_err(fault)?
+                    }
+                    Mark::Limit => {
+                        chart.draw_series([DashedPathElement::new(line.clone(), 6, 4, stroke)]).map_err(fault)?
+                    }
+                    Mark::Dots => chart.draw_series(dots(line, colour)).map_err(fault)?,
+                };
+                match series.mark {
+                    _ if series.name.is_empty() => {}
+                    Mark::Dots => {
+                        drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 9, y), 4, colour.filled()));
+                    }
+                    _ => {
+                        drawn.label(&series.name).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], stroke));
+                    }
                 }
-                if series.dots {
-                    let dots = line.iter().map(|&point| Circle::new(point, 4, colour.filled()));
-                    chart.draw_series(dots).map_err(fault)?;
+                if series.mark == Mark::LineAndDots {
+                    chart.draw_series(dots(line, colour)).map_err(fault)?;
                 }
             }
             legend(&mut chart, named)
@@ -264,8 +300,8 @@ impl BarChart {
         let across = Ruler { low: 0.0, high: self.names.len().max(1) as f64, ticks: places.clone() };
         let width = 0.8 / self.series.len().max(1) as f64;
         let name = |place: &f64| self.names.get(place.floor().max(0.0) as usize).cloned().unwrap_or_default();
-        draw(|area| {
-            let mut chart = frame(area, &self.title, (&across, &up))?;
+        draw(HEIGHT, (&self.title, ""), |area| {
+            let mut chart = frame(area, (&across, &up))?;
             mesh(&mut chart, (&self.x_title, &name), (&y, &|place| y.label(*place)))?;
             for (index, (label, values)) in self.series.iter().enumerate() {
                 let colour = colour(index);
@@ -312,29 +348,38 @@ pub fn histogram(title: impl Into<String>, x: Axis, series: &[(String, Vec<f64>)
             points.extend([(value_at(bin), count as f64), (value_at(bin + 1), count as f64)]);
         }
         points.push((value_at(BINS), 0.0));
-        Series { name: name.clone(), points, dots: false }
+        Series { name: name.clone(), points, mark: Mark::Line }
     };
     let series = series.iter().map(outline).collect();
-    LineChart { title: title.into(), x, y: Axis::linear("count").with_zero(), series }
+    let y = Axis::linear("count").with_zero();
+    LineChart { title: title.into(), subtitle: String::new(), x, y, series }
 }
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<Ruler, Ruler>>;
 
-fn draw(content: impl Fn(&Area<'_>) -> Result<()>) -> Result<String> {
+/// SVG text of what `content` draws under a title and a subtitle.
+fn draw(height: u32, (title, subtitle): (&str, &str), content: impl FnOnce(&Area<'_>) -> Result<()>) -> Result<String> {
     let mut text = String::new();
     {
-        let area = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
+        let area = SVGBackend::with_string(&mut text, (WIDTH, height)).into_drawing_area();
         area.fill(&WHITE).map_err(fault)?;
-        content(&area)?;
+        let mut inner = area.titled(title, (FONT, 22)).map_err(fault)?;
+        if !subtitle.is_empty() {
+            inner = inner.titled(subtitle, (FONT, 13).into_font().color(&LIMIT_COLOUR)).map_err(fault)?;
+        }
+        content(&inner)?;
         area.present().map_err(fault)?;
     }
     Ok(text)
 }
 
-fn frame<'a, 'b>(area: &'a Area<'b>, title: &str, (x, y): (&Ruler, &Ruler)) -> Result<Chart<'a, 'b>> {
+fn dots(line: &[(f64, f64)], colour: RGBColor) -> impl Iterator<Item = Circle<(f64, f64), i32>> + '_ {
+    line.iter().map(move |&point| Circle::new(point, 4, colour.filled()))
+}
+
+fn frame<'a, 'b>(area: &'a Area<'b>, (x, y): (&Ruler, &Ruler)) -> Result<Chart<'a, 'b>> {
     ChartBuilder::on(area)
-        .caption(title, (FONT, 22))
         .margin(16)
         .x_label_area_size(52)
         .y_label_area_size(84)
@@ -409,16 +454,17 @@ mod tests {
     fn charts_say_what_they_show() {
         let chart = LineChart {
             title: "time against error".into(),
+            subtitle: "a machine".into(),
             x: Axis::logarithmic("time per frame, seconds"),
             y: Axis::linear("error, dB"),
             series: vec![Series {
                 name: "ours".into(),
                 points: vec![(0.1, 20.0), (0.0, 3.0), (2.0, 30.0)],
-                dots: true,
+                mark: Mark::LineAndDots,
             }],
         };
         let svg = chart.svg().unwrap();
-        for text in ["time against error", "time per frame, seconds", "error, dB", "ours"] {
+        for text in ["time against error", "a machine", "time per frame, seconds", "error, dB", "ours"] {
             assert!(svg.contains(text), "{text}");
         }
         // The point at 0 has no place on a logarithmic axis: two dots in the chart.
@@ -428,6 +474,20 @@ mod tests {
         let bars = [("hair".to_owned(), 0.2), ("neck".to_owned(), f64::NAN)];
         let svg = BarChart::single("changes", "region", Axis::linear("change, 0 to 1"), &bars).svg().unwrap();
         assert!(svg.contains("hair") && svg.contains("neck") && svg.contains("change, 0 to 1"));
+    }
+
+    #[test]
+    fn lines_survive_what_they_cannot_show() {
+        for points in [&[][..], &[(0.0, 0.0)], &[(1.0, f64::INFINITY), (2.0, 5.0)], &[(1e-3, 1e9), (10.0, 1.0)]] {
+            for mark in [Mark::Line, Mark::LineAndDots, Mark::Dots, Mark::Limit] {
+                for axis in [Axis::linear("an axis, s"), Axis::logarithmic("an axis, s")] {
+                    let series = vec![Series { name: "one".into(), points: points.to_vec(), mark }];
+                    let chart = LineChart { x: axis.clone(), y: axis, series, ..LineChart::default() };
+                    let svg = chart.svg().unwrap();
+                    assert!(svg.contains("an axis, s") && !svg.contains("NaN"));
+                }
+            }
+        }
     }
 
     #[test]

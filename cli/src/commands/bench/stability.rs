@@ -2,11 +2,8 @@
 
 use clap::Args;
 use cnerf_core::{
-    bench::{
-        Machine,
-        chart::{self, Axis, Caption, Curve},
-        stability,
-    },
+    bench::{Machine, stability},
+    interop::chart::{Axis, LineChart, Mark, Series},
     kernels::Path,
 };
 
@@ -75,23 +72,15 @@ fn chart(report: &stability::Report) -> cnerf_core::Result<String> {
         .fold((1.0, 1e-9), |(low, high): (f64, f64), bound| (low.min(bound), high.max(bound)));
     let machine = Machine::measure();
     let title = format!("Error against f64, {} cases on {}", report.cases.len(), report.paths.join(", "));
-    chart::curves(
-        Caption { title: &title, subtitle: &machine.describe() },
-        Axis { label: "bound derived from the numbers' conditioning, relative L2", logarithmic: true },
-        Axis { label: "error of f32, relative L2 (exact ones at 1e-12)", logarithmic: true },
-        &[
-            Curve {
-                name: "a case's value or gradient closest to its bound".into(),
-                points,
-                joined: false,
-                limit: false,
-            },
-            Curve {
-                name: "the bound".into(),
-                points: vec![(ends.0, ends.0), (ends.1, ends.1)],
-                joined: true,
-                limit: true,
-            },
+    LineChart {
+        title,
+        subtitle: machine.describe(),
+        x: Axis::logarithmic("bound derived from the numbers' conditioning, relative L2"),
+        y: Axis::logarithmic("error of f32, relative L2 (exact ones at 1e-12)"),
+        series: vec![
+            Series { name: "a case's value or gradient closest to its bound".into(), points, mark: Mark::Dots },
+            Series { name: "the bound".into(), points: vec![(ends.0, ends.0), (ends.1, ends.1)], mark: Mark::Limit },
         ],
-    )
+    }
+    .svg()
 }

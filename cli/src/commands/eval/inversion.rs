@@ -6,7 +6,7 @@ use anyhow::bail;
 use clap::Args;
 use cnerf_core::{
     eval::perceptual::Perceptual,
-    interop::chart::{Axis, LineChart, Series, histogram},
+    interop::chart::{Axis, LineChart, Mark, Series, histogram},
     model::generator::Generator,
 };
 use cnerf_invert::{
@@ -153,11 +153,11 @@ impl InversionArguments {
     }
 
     fn draw(&self, variants: &[Measured]) -> anyhow::Result<()> {
-        let series = |points: fn(&[InversionScore]) -> Vec<(f64, f64)>, dots: bool| -> Vec<Series> {
+        let series = |points: fn(&[InversionScore]) -> Vec<(f64, f64)>, mark: Mark| -> Vec<Series> {
             let one = |measured: &Measured| Series {
                 name: measured.variant.name().to_owned(),
                 points: points(&measured.portraits),
-                dots,
+                mark,
             };
             variants.iter().map(one).collect()
         };
@@ -169,7 +169,8 @@ impl InversionArguments {
                 ),
                 x: Axis::linear("time, seconds").with_zero(),
                 y: Axis::linear("PSNR of what a step compared, dB"),
-                series: series(mean_curve, false),
+                subtitle: String::new(),
+                series: series(mean_curve, Mark::Line),
             };
             chart.save(path)?;
         }
@@ -179,10 +180,11 @@ impl InversionArguments {
             });
             histogram("Inverted photos", Axis::linear("PSNR, dB"), &values.collect::<Vec<_>>()).save(path)?;
         }
-        let novel = series(by_turn, true);
+        let novel = series(by_turn, Mark::LineAndDots);
         if let Some(path) = self.plots.path("novel_views").filter(|_| novel.iter().any(|one| !one.points.is_empty())) {
             let chart = LineChart {
                 title: "Views that were not shown".into(),
+                subtitle: String::new(),
                 x: Axis::linear("turn of azimuth from the photo, radians").with_zero(),
                 y: Axis::linear("PSNR, dB"),
                 series: novel,
