@@ -138,7 +138,9 @@ impl Console {
         use std::io::Write as _;
         let text = if self.json { serde_json::to_string(value)? } else { summary() };
         // A closed pipe (`cnerf info x | head -1`) is the reader's choice, not a fault.
-        let _ = writeln!(std::io::stdout(), "{text}");
+        if !text.is_empty() {
+            let _ = writeln!(std::io::stdout(), "{text}");
+        }
         Ok(())
     }
 }

@@ -3,6 +3,7 @@
 
 mod commands;
 mod console;
+mod interrupt;
 mod options;
 mod portraits;
 mod views;

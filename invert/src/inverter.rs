@@ -1,8 +1,8 @@
 //! The inverter: one optimiser step a call, from a subject to its portrait.
 
-use std::{collections::VecDeque, time::Instant};
+use std::{collections::VecDeque, path::Path, time::Instant};
 
-use candle_core::Tensor;
+use candle_core::{DType, Device, Tensor};
 use cnerf_core::{
     camera::Camera,
     data::{labels::LabelMap, picture},
@@ -10,11 +10,15 @@ use cnerf_core::{
         perceptual::Perceptual,
         quality::{self, Agreement},
     },
-    model::generator::{Generator, Picture},
+    model::{
+        file::{self, Tensors},
+        generator::{Generator, Picture},
+    },
 };
 use image::{Luma, RgbImage};
 
 use crate::{
+    checkpoint::{self, CheckpointHeader},
     config::InvertConfig,
     error::{Error, Result},
     events::Event,
@@ -111,6 +115,73 @@ impl<'a> Inverter<'a> {
         Ok(Self { generator, perceptual, config, model, subjects, targets, pivot, tune, settled, pending, seconds })
     }
 
+    /// Writes all that the steps so far have changed to `path`, under a temporary name first.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let mut tensors = Tensors::new();
+        self.pivot.save(&mut tensors)?;
+        let header = CheckpointHeader {
+            fingerprint: self.fingerprint()?,
+            pivot_steps: self.pivot.steps_done(),
+            tune: self.tune.as_ref().map(|tune| tune.save(&mut tensors)).transpose()?,
+            seconds: self.seconds,
+        };
+        checkpoint::write(path, &header, &tensors)
+    }
+
+    /// Goes on from what [`Self::save`] wrote: from here on everything is, bit by bit, as if it had never stopped.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or was written for other photos, another model or another configuration.
+    pub fn resume(&mut self, path: &Path) -> Result<()> {
+        let (header, tensors) = checkpoint::read(path)?;
+        if header.fingerprint != self.fingerprint()? {
+            let reason = "belongs to another photo, model or setting; repeat the command it was stopped in, or remove \
+                          it to begin anew";
+            return Err(Error::malformed(path, reason));
+        }
+        let damaged = |error: Error| Error::malformed(path, format!("{error}; remove it to begin anew"));
+        self.pivot.restore(header.pivot_steps, &tensors).map_err(damaged)?;
+        if let Some(state) = &header.tune {
+            let mut tune = Tune::new(self.generator, self.frozen()?, &self.config)?;
+            tune.restore(state, &tensors).map_err(damaged)?;
+            self.tune = Some(tune);
+        }
+        self.seconds += header.seconds;
+        Ok(())
+    }
+
+    /// Whether the step just done is a good one to [`Self::save`] after: it ended a phase.
+    pub fn ended_phase(&self) -> bool {
+        self.tune.is_none() && self.pivot.ended_phase()
+    }
+
+    /// Steps done, and those there are at most.
+    pub fn progress(&self) -> (usize, usize) {
+        let steps = self.config.steps();
+        let done = self.pivot.steps_done() + self.tune.as_ref().map_or(0, Tune::steps_done);
+        (done, steps.pivot() + steps.tune)
+    }
+
+    /// What the outcome is a function of, as one hash.
+    fn fingerprint(&self) -> Result<String> {
+        let config = serde_json::to_vec(&self.config).map_err(|error| Error::config("settings", error))?;
+        let named = format!("{} {}", self.model.hash, self.perceptual.is_some());
+        let bytes = |bytes: &[u8]| Tensor::from_slice(bytes, bytes.len(), &Device::Cpu);
+        let mut all =
+            Tensors::from([("config".to_owned(), bytes(&config)?), ("model".to_owned(), bytes(named.as_bytes())?)]);
+        for (index, (subject, target)) in self.subjects.iter().zip(&self.targets).enumerate() {
+            let camera = Camera::parameter_tensor(&[subject.aligned.camera], &Device::Cpu)?;
+            all.insert(format!("camera{index}"), camera.to_dtype(DType::F32)?);
+            all.insert(format!("photo{index}"), target.output.colour.clone());
+            all.extend(target.output.masks.iter().map(|masks| (format!("masks{index}"), masks.clone())));
+        }
+        Ok(file::hash(&all)?)
+    }
+
+    fn frozen(&self) -> Result<Frozen> {
+        Ok(Frozen { codes: self.pivot.codes()?, global: self.pivot.global()?, cameras: self.pivot.cameras()? })
+    }
+
     /// Does one step and says what happened; `None` when nothing is left to do.
     pub fn step(&mut self) -> Result<Option<Event>> {
         if let Some(event) = self.pending.pop_front() {
@@ -126,14 +197,10 @@ impl<'a> Inverter<'a> {
         if !self.pivot.is_done() {
             return Ok(Some(Event::Pivot(self.pivot.step(self.generator, &self.targets)?)));
         }
-        let tune = match &mut self.tune {
-            Some(tune) => tune,
-            None => {
-                let (codes, global, cameras) = (self.pivot.codes()?, self.pivot.global()?, self.pivot.cameras()?);
-                let frozen = Frozen { codes, global, cameras };
-                self.tune.insert(Tune::new(self.generator, frozen, &self.config)?)
-            }
-        };
+        if self.tune.is_none() {
+            self.tune = Some(Tune::new(self.generator, self.frozen()?, &self.config)?);
+        }
+        let Some(tune) = &mut self.tune else { return Ok(None) };
         if self.settled || tune.is_done() {
             return Ok(None);
         }
@@ -276,7 +343,7 @@ pub struct Opened {
 
 impl Opened {
     /// Opens `portrait`, read from `path`, with the model it was made with.
-    pub fn new(portrait: &Portrait, path: &std::path::Path, model: &Generator) -> Result<Self> {
+    pub fn new(portrait: &Portrait, path: &Path, model: &Generator) -> Result<Self> {
         portrait.check_model(path, &model.hash()?)?;
         let device = model.device();
         let codes = portrait.codes.unsqueeze(0)?.to_device(&device)?;

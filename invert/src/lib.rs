@@ -2,12 +2,15 @@
 //! generator around them, keep it all in one portrait file, and edit that.
 
 pub mod align;
+pub mod checkpoint;
 pub mod config;
 pub mod detect;
 pub mod edit;
 pub mod error;
 pub mod evaluation;
 pub mod events;
+#[cfg(test)]
+mod fuzz;
 pub mod inverter;
 pub mod objective;
 pub mod parser;

@@ -13,6 +13,8 @@ mod onnx;
 
 #[cfg(feature = "onnx")]
 pub use self::onnx::OnnxParser;
+#[cfg(all(test, feature = "onnx"))]
+pub(crate) use self::onnx::tests::identity as identity_network;
 
 /// Finds the nine regions in an aligned portrait.
 pub trait RegionParser {

@@ -9,7 +9,10 @@ use candle_core::{Tensor, Var};
 use cnerf_core::{
     camera::{CAMERA_PARAMETERS, Camera},
     config::UpsamplerStyle,
-    model::generator::{Generator, Picture},
+    model::{
+        file::Tensors,
+        generator::{Generator, Picture},
+    },
     region::REGION_COUNT,
     render::RenderSettings,
     rng::Stream,
@@ -17,6 +20,7 @@ use cnerf_core::{
 };
 
 use crate::{
+    checkpoint,
     config::{InvertConfig, PivotConfig, Steps},
     error::Result,
     events::StepReport,
@@ -84,6 +88,43 @@ impl Pivot {
     /// Whether all steps are done.
     pub fn is_done(&self) -> bool {
         self.step >= self.steps.pivot()
+    }
+
+    /// Whether the step just done was the last of its phase.
+    pub fn ended_phase(&self) -> bool {
+        let Steps { shared, free, .. } = self.steps;
+        [shared, shared + free, self.steps.pivot()].contains(&self.step)
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> usize {
+        self.step
+    }
+
+    /// Adds all that steps have changed to a checkpoint's tensors.
+    pub(crate) fn save(&self, tensors: &mut Tensors) -> Result<()> {
+        let values = self.variables().into_iter().map(|(name, value)| (name, value.as_tensor().clone()));
+        checkpoint::put_all(tensors, "pivot", values);
+        Ok(self.optimiser.save("pivot.adam", tensors)?)
+    }
+
+    /// Goes back to where [`Self::save`] was called, after `step` steps.
+    pub(crate) fn restore(&mut self, step: usize, tensors: &Tensors) -> Result<()> {
+        for (name, variable) in self.variables() {
+            variable.set(&checkpoint::take(tensors, &format!("pivot.{name}"), variable.dims())?)?;
+        }
+        self.step = step.min(self.steps.pivot());
+        // The rows are freed by the step after the shared phase's last.
+        let moving = if self.step <= self.steps.shared { &self.shared } else { &self.rows };
+        self.optimiser = self.optimiser_of(moving.clone());
+        Ok(self.optimiser.load("pivot.adam", tensors)?)
+    }
+
+    fn variables(&self) -> Vec<(String, Var)> {
+        let mut all = vec![("shared".to_owned(), self.shared.clone()), ("rows".to_owned(), self.rows.clone())];
+        all.extend(self.global.iter().map(|code| ("global".to_owned(), code.clone())));
+        all.extend(self.cameras.iter().enumerate().map(|(index, camera)| (format!("camera{index}"), camera.clone())));
+        all
     }
 
     /// The codes as they are now, `[1, 9, 2, D]`, without a graph.

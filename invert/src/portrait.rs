@@ -78,7 +78,8 @@ pub struct Metrics {
     pub steps_pivot: usize,
     /// Optimiser steps on weights.
     pub steps_tune: usize,
-    /// Wall time, seconds.
+    /// Wall time, seconds. Not in the file: the same photo and seed give the same bytes.
+    #[serde(skip_serializing)]
     pub seconds: f64,
 }
 

@@ -11,13 +11,14 @@ use std::collections::BTreeMap;
 use candle_core::{Tensor, Var};
 use cnerf_core::{
     camera::Camera,
-    model::generator::Generator,
+    model::{file::Tensors, generator::Generator},
     render::RenderSettings,
     rng::Stream,
     train::optimiser::{Adam, Betas, Group, Schedule},
 };
 
 use crate::{
+    checkpoint::{self, TuneState},
     config::{InvertConfig, PivotConfig, Steps, TuneConfig},
     error::Result,
     events::StepReport,
@@ -146,6 +147,34 @@ impl Tune {
     /// Steps done.
     pub fn steps_done(&self) -> usize {
         self.step
+    }
+
+    /// Adds all that steps have changed to a checkpoint's tensors, and says the rest.
+    pub(crate) fn save(&self, tensors: &mut Tensors) -> Result<TuneState> {
+        checkpoint::put_all(tensors, "tune.weight", tuned_weights(&self.generator)?);
+        if let Some(best) = &self.best {
+            checkpoint::put_all(tensors, "tune.best", best.weights.clone());
+        }
+        self.optimiser.save("tune.adam", tensors)?;
+        let Progress { smoothed, lowest, since_lowest } = self.progress;
+        Ok(TuneState {
+            steps: self.step,
+            smoothed,
+            lowest: lowest.is_finite().then_some(lowest),
+            since_lowest,
+            best_loss: self.best.as_ref().map(|best| best.loss),
+        })
+    }
+
+    /// Goes back to where [`Self::save`] was called.
+    pub(crate) fn restore(&mut self, state: &TuneState, tensors: &Tensors) -> Result<()> {
+        self.generator.parameters().restore(&checkpoint::all_of(tensors, "tune.weight"))?;
+        self.optimiser.load("tune.adam", tensors)?;
+        self.step = state.steps;
+        let lowest = state.lowest.unwrap_or(f64::INFINITY);
+        self.progress = Progress { smoothed: state.smoothed, lowest, since_lowest: state.since_lowest };
+        self.best = state.best_loss.map(|loss| Best { loss, weights: checkpoint::all_of(tensors, "tune.best") });
+        Ok(())
     }
 
     /// One step; `original` is the generator tuning began with, `targets` are as many as there are cameras.

@@ -1,7 +1,13 @@
 //! Real photos as people have them: turned by their camera, with several people, too dark, several at once; and face
 //! parsers brought along.
 
-use std::{fs, path::Path};
+use std::{
+    fs,
+    path::Path,
+    process::Stdio,
+    thread,
+    time::{Duration, Instant},
+};
 
 use cnerf_tests::{Folder, MODEL, number};
 use image::{RgbImage, codecs::jpeg::JpegEncoder, imageops};
@@ -146,4 +152,63 @@ fn photos_of_one_person_share_codes_and_keep_their_cameras() {
         file.tensor("codes").unwrap().data().to_vec()
     };
     assert!(codes("out/left.cnerf") == codes("out/right.cnerf"), "one person, one set of codes");
+}
+
+/// Starts an inversion of face.png to `out` and waits for its first checkpoint.
+fn started(folder: &Folder, out: &str, line: &str) -> std::process::Child {
+    let mut command = folder.command(&format!("invert face.png --out {out} {line}"));
+    let mut inversion = command.stderr(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let began = Instant::now();
+    while !folder.path(out).join("face.cnerf.part").exists() {
+        assert!(inversion.try_wait().unwrap().is_none(), "it ended without a checkpoint");
+        assert!(began.elapsed() < Duration::from_secs(120), "no checkpoint was written");
+        thread::sleep(Duration::from_millis(2));
+    }
+    inversion
+}
+
+#[test]
+fn stopped_inversions_resume_to_the_same_portrait() {
+    let folder = Folder::with_model("resume");
+    folder.photo("face.png");
+    let line = format!("--model {MODEL} --pivot-steps 160 --tune-steps 12 --no-progress");
+    folder.run(&format!("invert face.png --out whole {line}")).done();
+    assert_eq!(folder.list("whole"), ["face.cnerf", "face.png"], "the checkpoint goes when the portrait is there");
+
+    let mut killed = started(&folder, "killed", &line);
+    killed.kill().unwrap();
+    killed.wait().unwrap();
+    assert!(!folder.path("killed/face.cnerf").exists(), "it ended before it could be killed");
+    let run = folder.run(&format!("invert face.png --out killed {line} --resume")).done();
+    assert!(run.stderr.contains("goes on after step"), "{}", run.stderr);
+    assert!(folder.read("killed/face.cnerf") == folder.read("whole/face.cnerf"), "the portraits differ");
+    assert!(folder.read("killed/face.png") == folder.read("whole/face.png"), "the pictures differ");
+    assert_eq!(folder.list("killed"), ["face.cnerf", "face.png"]);
+
+    // What is finished stays; another setting is no continuation of this one.
+    let report = folder.json(&format!("invert face.png --out killed {line} --resume"));
+    assert_eq!(report["portraits"].as_array().map(Vec::len), Some(1), "{report}");
+    fs::write(folder.path("killed/face.cnerf.part"), b"cut off").unwrap();
+    fs::remove_file(folder.path("killed/face.cnerf")).unwrap();
+    let run = folder.run(&format!("invert face.png --out killed {line} --resume"));
+    assert_eq!(run.code, 2);
+    assert!(run.stderr.contains("face.cnerf.part"), "{}", run.stderr);
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_stops_an_inversion_and_says_how_to_go_on() {
+    let folder = Folder::with_model("interrupt");
+    folder.photo("face.png");
+    let line = format!("--model {MODEL} --pivot-steps 400 --tune-steps 2 --no-progress");
+    let interrupted = started(&folder, "out", &line);
+    let id = interrupted.id().to_string();
+    assert!(std::process::Command::new("kill").args(["-INT", &id]).status().unwrap().success());
+    let output = interrupted.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.lines().any(|line| line.contains("go on with: ") && line.ends_with("--resume")), "{said}");
+    assert_eq!(folder.list("out"), ["face.cnerf.part"]);
+    folder.run(&format!("invert face.png --out out {line} --resume")).done();
+    assert_eq!(folder.list("out"), ["face.cnerf", "face.png"]);
 }

@@ -1,24 +1,33 @@
 //! `cnerf invert`: photos to portrait files. Listens to the inverter and draws its progress.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context as _, bail};
 use clap::Args;
 use cnerf_core::{data::picture, eval::perceptual::Perceptual, model::generator::Generator};
 use cnerf_invert::{
+    checkpoint,
     config::InvertConfig,
     events::Event,
     inverter::{Inversion, Inverter, estimate_seconds},
     parser::{ParserConfig, RegionParser},
     photo::{PhotoOptions, Subject},
+    portrait::Portrait,
 };
 use serde::Serialize;
 
 use crate::{
     console::{Console, Outcome},
+    interrupt::{Interrupt, command_to_resume},
     options::{ModelOptions, OverwriteOptions, stem},
     views::side_by_side,
 };
+
+/// What has been done is written this often at least.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(10);
 
 /// Arguments of `cnerf invert`.
 #[derive(Args, Debug)]
@@ -53,6 +62,9 @@ pub struct InvertArguments {
     lpips: Option<PathBuf>,
     #[command(flatten)]
     model: ModelOptions,
+    /// Go on with what was stopped: finished portraits stay, the one under way continues from its last checkpoint
+    #[arg(long, conflicts_with = "overwrite")]
+    resume: bool,
     #[command(flatten)]
     overwrite: OverwriteOptions,
 }
@@ -63,12 +75,15 @@ struct Tools<'a> {
     generator: &'a Generator,
     perceptual: Option<&'a Perceptual>,
     parser: Option<&'a dyn RegionParser>,
+    interrupt: &'a Interrupt,
 }
 
 #[derive(Default, Serialize)]
 struct Report {
     portraits: Vec<Inverted>,
     failed: Vec<Failed>,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    interrupted: bool,
 }
 
 #[derive(Serialize)]
@@ -87,6 +102,26 @@ struct Inverted {
     steps_tune: usize,
 }
 
+impl Inverted {
+    fn of(input: &Path, output: PathBuf, portrait: &Portrait, seconds: f64) -> Self {
+        let (metrics, camera) = (&portrait.metrics, portrait.camera);
+        Self {
+            input: input.to_owned(),
+            output,
+            seconds,
+            psnr: metrics.psnr,
+            ms_ssim: metrics.ms_ssim,
+            lpips: metrics.lpips,
+            mask_miou: metrics.mask_miou,
+            azimuth: camera.azimuth_rad,
+            elevation: camera.elevation_rad,
+            depth_drift: metrics.depth_drift,
+            steps_pivot: metrics.steps_pivot,
+            steps_tune: metrics.steps_tune,
+        }
+    }
+}
+
 #[derive(Serialize)]
 struct Failed {
     input: PathBuf,
@@ -103,7 +138,9 @@ impl InvertArguments {
         }
         for (index, photo) in self.photos.iter().enumerate() {
             let output = self.output(photo);
-            self.overwrite.check(&output)?;
+            if !self.resume {
+                self.overwrite.check(&output)?;
+            }
             if let Some(other) = self.photos.iter().take(index).find(|other| self.output(other) == output) {
                 let (photo, other, output) = (photo.display(), other.display(), output.display());
                 bail!("{photo} and {other} would both become {output}: rename one, or invert them apart");
@@ -112,12 +149,17 @@ impl InvertArguments {
         let generator = self.model.load_or("portrait")?;
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
         let parser = self.parser.load()?;
-        let tools = Tools { generator: &generator, perceptual: perceptual.as_ref(), parser: parser.as_deref() };
+        let interrupt = Interrupt::listen()?;
+        let (perceptual, parser) = (perceptual.as_ref(), parser.as_deref());
+        let tools = Tools { generator: &generator, perceptual, parser, interrupt: &interrupt };
         let mut report = Report::default();
         let groups: Vec<&[PathBuf]> =
             if self.same_person { vec![self.photos.as_slice()] } else { self.photos.chunks(1).collect() };
         let mut told = console.is_quiet();
         for photos in groups {
+            if self.resume && self.keep_finished(photos, &mut report, console)? {
+                continue;
+            }
             let failed = report.failed.len();
             let subjects = self.read(photos, &tools, &mut report, console);
             if !told && !subjects.is_empty() {
@@ -130,14 +172,19 @@ impl InvertArguments {
                     self.fail(photo, &error, &mut report, console);
                 }
             }
+            if report.interrupted {
+                break;
+            }
         }
-        if report.portraits.is_empty() {
+        if report.interrupted {
+            console.warn(format_args!("stopped; go on with: {}", command_to_resume()));
+        } else if report.portraits.is_empty() {
             if let [only] = report.failed.as_slice() {
                 bail!("{}", only.error);
             }
             bail!("none of {} photos could be inverted", self.photos.len());
         }
-        let partial = !report.failed.is_empty();
+        let partial = report.interrupted || !report.failed.is_empty();
         console.result(&report, || {
             let lines = report.portraits.iter().map(|one| {
                 format!(
@@ -151,6 +198,19 @@ impl InvertArguments {
             lines.collect::<Vec<_>>().join("\n")
         })?;
         Ok(if partial { Outcome::Partial } else { Outcome::Done })
+    }
+
+    /// Whether all these photos have their portraits already, which are then reported.
+    fn keep_finished(&self, photos: &[PathBuf], report: &mut Report, console: &Console) -> anyhow::Result<bool> {
+        if !photos.iter().all(|photo| self.output(photo).exists()) {
+            return Ok(false);
+        }
+        for photo in photos {
+            let portrait = Portrait::load(&self.output(photo))?;
+            console.note(format_args!("{}: finished before", self.output(photo).display()));
+            report.portraits.push(Inverted::of(photo, self.output(photo), &portrait, 0.0));
+        }
+        Ok(true)
     }
 
     /// Says how long it will take, before it does.
@@ -213,11 +273,18 @@ impl InvertArguments {
         let Tools { generator, perceptual, .. } = *tools;
         let (paths, subjects): (Vec<&Path>, Vec<Subject>) = photos.into_iter().unzip();
         let Some(first) = paths.first() else { return Ok(()) };
-        let began = std::time::Instant::now();
+        let began = Instant::now();
         let model_name = self.model.model.as_deref().unwrap_or("portrait");
         let mut inverter = Inverter::of_person(generator, model_name, subjects, self.config.clone(), perceptual)?;
+        let part = checkpoint::path_of(&self.output(first));
+        if self.resume && part.exists() {
+            inverter.resume(&part)?;
+            let (done, all) = inverter.progress();
+            console.note(format_args!("{}: goes on after step {done} of {all}", first.display()));
+        }
         let mut bar = console.bar(0, "pivot");
         let mut tuning = false;
+        let mut saved = Instant::now();
         while let Some(event) = inverter.step().with_context(|| first.display().to_string())? {
             match event {
                 Event::Pivot(step) | Event::Tune(step) => {
@@ -233,6 +300,16 @@ impl InvertArguments {
                 Event::Settled { step } => bar.set_message(format!("settled after {step} steps")),
                 Event::Warning(text) => bar.suspend(|| console.warn(text)),
             }
+            let stop = tools.interrupt.asked();
+            if stop || inverter.ended_phase() || saved.elapsed() > CHECKPOINT_EVERY {
+                inverter.save(&part)?;
+                saved = Instant::now();
+            }
+            if stop {
+                bar.finish_and_clear();
+                report.interrupted = true;
+                return Ok(());
+            }
         }
         let inversions = inverter.finish_all()?;
         bar.finish_and_clear();
@@ -242,24 +319,16 @@ impl InvertArguments {
             let strip = [panels.photo, panels.pivot, panels.tuned, panels.regions, panels.depth, left, right];
             portrait.save(&output)?;
             picture::write(&output.with_extension("png"), &side_by_side(&strip))?;
-            let (metrics, camera, seconds) = (portrait.metrics, portrait.camera, began.elapsed().as_secs_f64());
-            console.note(format_args!("{}: {:.1} dB in {seconds:.0} s", output.display(), metrics.psnr));
-            report.portraits.push(Inverted {
-                input: photo.to_owned(),
-                output,
-                seconds,
-                psnr: metrics.psnr,
-                ms_ssim: metrics.ms_ssim,
-                lpips: metrics.lpips,
-                mask_miou: metrics.mask_miou,
-                azimuth: camera.azimuth_rad,
-                elevation: camera.elevation_rad,
-                depth_drift: metrics.depth_drift,
-                steps_pivot: metrics.steps_pivot,
-                steps_tune: metrics.steps_tune,
-            });
+            let seconds = began.elapsed().as_secs_f64();
+            console.note(format_args!("{}: {:.1} dB in {seconds:.0} s", output.display(), portrait.metrics.psnr));
+            report.portraits.push(Inverted::of(photo, output, &portrait, seconds));
         }
-        Ok(())
+        match std::fs::remove_file(&part) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                Err(error).with_context(|| part.display().to_string())
+            }
+            _ => Ok(()),
+        }
     }
 }
 

@@ -2,10 +2,7 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::Arc,
 };
 
 use anyhow::{Context as _, bail};
@@ -25,6 +22,7 @@ use serde::Serialize;
 
 use crate::{
     console::{Console, Outcome},
+    interrupt::Interrupt,
     options::ModelSource,
 };
 
@@ -152,14 +150,7 @@ impl TrainArguments {
     }
 
     fn listen(&self, mut trainer: Trainer, console: &Console) -> anyhow::Result<Outcome> {
-        let stop = Arc::new(AtomicBool::new(false));
-        let asked = Arc::clone(&stop);
-        ctrlc::set_handler(move || {
-            // The first Ctrl-C finishes the step and writes a checkpoint; the second one ends at once.
-            if asked.swap(true, Ordering::SeqCst) {
-                std::process::exit(130);
-            }
-        })?;
+        let interrupt = Interrupt::listen()?;
         let began = std::time::Instant::now();
         let mut bar = console.bar(0, "");
         let (mut model, mut last) = (None, None);
@@ -184,7 +175,7 @@ impl TrainArguments {
                     Event::Warning(text) => bar.suspend(|| console.warn(text)),
                 }
             }
-            if stop.load(Ordering::SeqCst) {
+            if interrupt.asked() {
                 if let Some(path) = trainer.checkpoint()? {
                     bar.suspend(|| console.note(path.display()));
                 }

@@ -1,12 +1,15 @@
 //! A region in a colour of one's own: its texture code is moved until the region's mean colour is the one asked for.
 //!
-//! Descent runs on rays of the field, which is cheap; the finished picture differs from the field's by what the
-//! upsampler adds, so the aim is corrected by that difference between rounds.
+//! In two parts. Descent on rays of the field, which is cheap, takes the code near: the region recoloured with its own
+//! light and shade. Then Newton's steps on the finished picture, upsampler included, each the shortest move of the code
+//! that closes what the mean colour still misses: they hit the colour and leave the shading alone.
 
 use std::str::FromStr;
 
 use candle_core::Tensor;
-use cnerf_core::{camera::Camera, codes::Aspect, data::labels::LabelMap, region::Region, rng::Stream};
+use cnerf_core::{
+    camera::Camera, codes::Aspect, data::labels::LabelMap, model::generator::Picture, region::Region, rng::Stream,
+};
 use kornia_image::{Image, ImageError, ImageSize};
 use kornia_imgproc::color::lab_from_rgb_f32;
 use serde::{Deserialize, Serialize};
@@ -16,21 +19,35 @@ use crate::{
     error::{Error, Result},
     inverter::Opened,
     objective,
+    pivot::whole_picture,
     space::CodeSpace,
 };
 
 /// The first element of every stream drawn here.
 const STREAM: u64 = 0x636f_6c6f;
-/// Rounds, each with its aim corrected by what the picture before it missed.
-const ROUNDS: usize = 3;
-const STEPS: usize = 40;
+/// Steps of descent on rays.
+const STEPS: usize = 80;
 /// Rays of a step.
 const RAYS: usize = 512;
 const RATE: f64 = 0.1;
-/// Weight of the light and shade within the region, held to the portrait's own: strands stay strands.
+/// Weight of the light and shade within the region: strands stay strands.
 const CONTRAST: f64 = 0.5;
 /// Holds the codes near where they were.
 const HOLD: f64 = 1e-3;
+/// Luma, in [0, 1], that is added before light and shade are measured as shares of the mean: what is nearly black has
+/// no shading worth stretching.
+const SHADE_FLOOR: f64 = 0.1;
+/// Most of Newton's steps, failed ones included.
+const NEWTON_STEPS: usize = 10;
+/// Longest of them, root mean square of the code's whitened coordinates: farther away the picture is no longer linear.
+const NEWTON_REACH: f64 = 0.35;
+/// Share of the mean squared gradient that is added to a Newton step's diagonal: a colour the code hardly moves is
+/// not chased.
+const NEWTON_DAMPING: f64 = 1e-3;
+/// A perceived difference that is not worth another step.
+const CLOSE_ENOUGH: f64 = 0.5;
+/// ITU-R BT.601.
+const LUMA: [f64; 3] = [0.299, 0.587, 0.114];
 
 /// An sRGB colour, written `#7a3b12`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -89,20 +106,8 @@ pub fn perceived_difference(a: [f64; 3], b: [f64; 3]) -> Result<f64> {
 /// The mean colour in [-1, 1] of `region` in the portrait's finished picture from `camera`; none if it does not show.
 pub fn mean_colour(opened: &Opened, camera: &Camera, region: Region) -> Result<Option<[f64; 3]>> {
     let picture = opened.picture(camera)?;
-    let labels = LabelMap::from_masks(&picture.masks.squeeze(0)?)?;
-    let rgb: Vec<Vec<f32>> = picture.rgb.clamp(-1.0, 1.0)?.squeeze(0)?.flatten_from(1)?.to_vec2()?;
-    let inside: Vec<usize> = (0..labels.labels().len())
-        .filter(|index| labels.labels().get(*index).copied().and_then(Region::from_label) == Some(region))
-        .collect();
-    if inside.is_empty() {
-        return Ok(None);
-    }
-    let mut mean = [0.0; 3];
-    for (sum, plane) in mean.iter_mut().zip(&rgb) {
-        *sum = inside.iter().filter_map(|index| plane.get(*index)).map(|value| f64::from(*value)).sum::<f64>()
-            / inside.len() as f64;
-    }
-    Ok(Some(mean))
+    let Some(inside) = Inside::of(&picture, region)? else { return Ok(None) };
+    inside.mean(&picture.rgb).map(Some)
 }
 
 /// Codes `[1, 9, 2, D]` near the portrait's that show `region` in `colour`, from `camera`. Only its texture row moves.
@@ -111,45 +116,193 @@ pub fn mean_colour(opened: &Opened, camera: &Camera, region: Region) -> Result<O
 /// [`Error::Core`] if the region does not show from there.
 pub fn codes(opened: &Opened, camera: &Camera, region: Region, colour: Colour) -> Result<Tensor> {
     let wanted = colour.0.map(|value| f64::from(value) / 127.5 - 1.0);
-    let device = opened.generator.device();
-    let resolution = opened.generator.render_resolution();
-    let frame = opened.picture(camera)?.frame;
-    let labels = LabelMap::from_masks(&frame.masks.squeeze(0)?)?;
-    let inside: Vec<u32> = (0..labels.labels().len() as u32)
-        .filter(|index| labels.labels().get(*index as usize).copied().and_then(Region::from_label) == Some(region))
-        .collect();
-    if inside.is_empty() {
-        return Err(Error::config("--color", format!("the portrait shows no {region}; name a region that shows")));
-    }
-    let own = frame.colour.detach().flatten_from(2)?;
-    let own_mean = own.index_select(&Tensor::new(inside.as_slice(), &device)?, 2)?.mean_keepdim(2)?;
-    let view = Camera::parameter_tensor(&[*camera], &device)?;
-    let sampling = opened.generator.render_settings().sampling;
+    let picture = opened.picture(camera)?;
+    let hidden = || Error::config("--color", format!("the portrait shows no {region}; name a region that shows"));
+    let finished = Inside::of(&picture, region)?.ok_or_else(hidden)?.mean(&picture.rgb)?;
     let space = CodeSpace::measure(&opened.generator)?;
-    let mut search = Displacement::new(&opened.codes, space, region.into(), Aspect::Texture, ROUNDS * STEPS, RATE)?;
-    let mut aim = wanted;
-    for round in 0..ROUNDS {
-        let target = Tensor::new(&aim.map(|value| value as f32), &device)?.reshape((1, 3, 1))?;
-        for step in 0..STEPS {
-            let mut random = Stream::new(0, &[STREAM, (round * STEPS + step) as u64]);
-            let order = random.permutation(inside.len()).into_iter().take(RAYS);
-            let chosen: Vec<u32> = order.filter_map(|index| inside.get(index).copied()).collect();
-            let pixels = Tensor::new(chosen.as_slice(), &device)?;
-            let field = opened.generator.field().portraits(&search.live()?)?;
-            let output = objective::render_pixels(&field, &view, &pixels, resolution, &sampling, &mut random)?;
-            let mean = output.colour.mean_keepdim(2)?;
-            let shade = output.colour.broadcast_sub(&mean)?;
-            let own_shade = own.index_select(&pixels, 2)?.broadcast_sub(&own_mean)?;
-            let loss = ((mean - &target)?.sqr()?.sum_all()? + ((shade - own_shade)?.sqr()?.mean_all()? * CONTRAST)?)?;
-            search.descend(&(loss + (search.distance()? * HOLD)?)?, "the colour's loss")?;
+    let mut search = Displacement::new(&opened.codes, space, region.into(), Aspect::Texture, STEPS, RATE)?;
+    descend(&mut search, opened, &picture, camera, region, wanted, finished)?;
+    newton(&mut search, opened, camera, region, wanted)?;
+    search.codes()
+}
+
+/// Takes the code near on rays of the field. What the upsampler adds to the mean is taken to stay what it was:
+/// `finished` is the mean of the whole `picture`.
+fn descend(
+    search: &mut Displacement,
+    opened: &Opened,
+    picture: &Picture,
+    camera: &Camera,
+    region: Region,
+    wanted: [f64; 3],
+    finished: [f64; 3],
+) -> Result<()> {
+    let device = opened.generator.device();
+    let labels = LabelMap::from_masks(&picture.frame.masks.squeeze(0)?)?;
+    let inside = pixels_of(&labels, region);
+    // Too thin for the render's own pixels: Newton's steps work alone.
+    if inside.is_empty() {
+        return Ok(());
+    }
+    let chosen = Tensor::new(inside.as_slice(), &device)?;
+    let own = picture.frame.colour.detach().flatten_from(2)?.index_select(&chosen, 2)?;
+    let own: Vec<Vec<f32>> = own.squeeze(0)?.to_vec2()?;
+    let rendered = means(&own);
+    let aim: [f64; 3] =
+        std::array::from_fn(|channel| wanted[channel] - (finished[channel] - rendered[channel]).clamp(-0.2, 0.2));
+    let aimed = Tensor::new(&aim.map(|value| value as f32), &device)?.reshape((1, 3, 1))?;
+    let shade = Tensor::from_vec(shades(&own, aim), (1, 3, inside.len()), &device)?;
+    let view = Camera::parameter_tensor(&[*camera], &device)?;
+    let resolution = opened.generator.render_resolution();
+    let sampling = opened.generator.render_settings().sampling;
+    for step in 0..STEPS {
+        let mut random = Stream::new(0, &[STREAM, step as u64]);
+        let order: Vec<u32> =
+            random.permutation(inside.len()).into_iter().take(RAYS).map(|place| place as u32).collect();
+        let order = Tensor::new(order.as_slice(), &device)?;
+        let pixels = chosen.index_select(&order, 0)?;
+        let field = opened.generator.field().portraits(&search.live()?)?;
+        let output = objective::render_pixels(&field, &view, &pixels, resolution, &sampling, &mut random)?;
+        let mean = output.colour.mean_keepdim(2)?;
+        let off = (output.colour.broadcast_sub(&mean)? - shade.index_select(&order, 2)?)?;
+        let loss = ((mean - &aimed)?.sqr()?.sum_all()? + (off.sqr()?.mean_all()? * CONTRAST)?)?;
+        search.descend(&(loss + (search.distance()? * HOLD)?)?, "the colour's loss")?;
+    }
+    Ok(())
+}
+
+/// Closes what the finished picture's mean colour still misses, and ends at the nearest it found.
+fn newton(search: &mut Displacement, opened: &Opened, camera: &Camera, region: Region, wanted: [f64; 3]) -> Result<()> {
+    let view = Camera::parameter_tensor(&[*camera], &opened.generator.device())?;
+    let mut nearest: Option<(f64, Tensor)> = None;
+    let mut step = search.rows()?.zeros_like()?;
+    for _ in 0..=NEWTON_STEPS {
+        let picture = whole_picture(&opened.generator, &search.live()?, opened.global.as_ref(), &view, true)?;
+        let Some(inside) = Inside::of(&picture, region)? else { break };
+        let mean = inside.mean(&picture.rgb)?;
+        let difference = perceived_difference(mean, wanted)?;
+        match &nearest {
+            // Too far: half as far, from where it was nearest.
+            Some((least, rows)) if difference >= *least => {
+                search.set(rows)?;
+                step = (step * 0.5)?;
+            }
+            _ => {
+                nearest = Some((difference, search.rows()?));
+                if difference < CLOSE_ENOUGH {
+                    break;
+                }
+                let missed: [f64; 3] = std::array::from_fn(|channel| wanted[channel] - mean[channel]);
+                step = shortest(&inside.gradients(&picture.rgb, search)?, missed)?;
+            }
         }
-        let found = Opened { codes: search.codes()?, ..opened.clone() };
-        if let Some(found) = mean_colour(&found, camera, region)? {
-            (0..3).for_each(|channel| aim[channel] += wanted[channel] - found[channel]);
-            aim = aim.map(|value| value.clamp(-1.2, 1.2));
+        search.shift(&step)?;
+    }
+    if let Some((_, rows)) = nearest {
+        search.set(&rows)?;
+    }
+    Ok(())
+}
+
+/// The shortest step Δ with J Δ = `missed`, damped and no longer than [`NEWTON_REACH`]. `gradients` are the rows of J,
+/// each as the code's rows are.
+fn shortest(gradients: &[Tensor; 3], missed: [f64; 3]) -> Result<Tensor> {
+    let mut gram = [[0.0; 3]; 3];
+    for (row, a) in gradients.iter().enumerate() {
+        for (column, b) in gradients.iter().enumerate() {
+            gram[row][column] = objective::scalar(&(a * b)?.sum_all()?)?;
         }
     }
-    search.codes()
+    let damping = NEWTON_DAMPING * (0..3).map(|index| gram[index][index]).sum::<f64>() / 3.0 + 1e-12;
+    (0..3).for_each(|index| gram[index][index] += damping);
+    let shares = solve(gram, missed);
+    let mut step = gradients[0].zeros_like()?;
+    for (gradient, share) in gradients.iter().zip(shares) {
+        step = (step + (gradient * share)?)?;
+    }
+    let length = objective::scalar(&step.sqr()?.mean_all()?)?.sqrt();
+    Ok(if length > NEWTON_REACH { (step * (NEWTON_REACH / length))? } else { step })
+}
+
+/// Solves a symmetric positive definite system by Cramer's rule.
+fn solve(matrix: [[f64; 3]; 3], right: [f64; 3]) -> [f64; 3] {
+    let determinant = |m: &[[f64; 3]; 3]| {
+        m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+            + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
+    };
+    let whole = determinant(&matrix);
+    std::array::from_fn(|column| {
+        let mut replaced = matrix;
+        replaced.iter_mut().zip(right).for_each(|(row, value)| row[column] = value);
+        if whole > 0.0 { determinant(&replaced) / whole } else { 0.0 }
+    })
+}
+
+/// Where a finished picture shows a region.
+struct Inside {
+    /// Indices in row order, u32.
+    pixels: Tensor,
+    count: usize,
+}
+
+impl Inside {
+    /// None if the region does not show.
+    fn of(picture: &Picture, region: Region) -> Result<Option<Self>> {
+        let labels = LabelMap::from_masks(&picture.masks.detach().squeeze(0)?)?;
+        let pixels = pixels_of(&labels, region);
+        let count = pixels.len();
+        let pixels = Tensor::new(pixels.as_slice(), picture.masks.device())?;
+        Ok((count > 0).then_some(Self { pixels, count }))
+    }
+
+    /// Colours `[3, N]` with their graph.
+    fn colours(&self, rgb: &Tensor) -> Result<Tensor> {
+        Ok(rgb.squeeze(0)?.flatten_from(1)?.index_select(&self.pixels, 1)?)
+    }
+
+    fn mean(&self, rgb: &Tensor) -> Result<[f64; 3]> {
+        Ok(means(&self.colours(&rgb.detach())?.clamp(-1.0, 1.0)?.to_vec2()?))
+    }
+
+    /// Gradients of the three channels' means to the moving rows; pixels beyond [-1, 1] have none.
+    fn gradients(&self, rgb: &Tensor, search: &Displacement) -> Result<[Tensor; 3]> {
+        let colours = self.colours(rgb)?;
+        let within = colours.detach().abs()?.le(1.0)?.to_dtype(colours.dtype())?;
+        let shown = (colours * within)?;
+        let of = |channel: usize| search.gradient(&(shown.narrow(0, channel, 1)?.sum_all()? / self.count as f64)?);
+        Ok([of(0)?, of(1)?, of(2)?])
+    }
+}
+
+fn pixels_of(labels: &LabelMap, region: Region) -> Vec<u32> {
+    let is_inside = |(_, label): &(usize, &u8)| Region::from_label(**label) == Some(region);
+    labels.labels().iter().enumerate().filter(is_inside).map(|(index, _)| index as u32).collect()
+}
+
+/// The mean of every channel.
+fn means(channels: &[Vec<f32>]) -> [f64; 3] {
+    let mut means = [0.0; 3];
+    for (mean, channel) in means.iter_mut().zip(channels) {
+        *mean = channel.iter().map(|value| f64::from(*value)).sum::<f64>() / channel.len().max(1) as f64;
+    }
+    means
+}
+
+/// How far each pixel of `aim`, lit as the `own` colours are, is from `aim` itself: `[3, N]` in row order. Light
+/// multiplies: a dark colour has less of it than a bright one.
+fn shades(own: &[Vec<f32>], aim: [f64; 3]) -> Vec<f32> {
+    let count = own.iter().map(Vec::len).min().unwrap_or(0);
+    let unit = |value: f64| (value + 1.0) / 2.0;
+    let luma = |index: usize| {
+        let parts =
+            own.iter().zip(LUMA).map(|(channel, share)| share * channel.get(index).map_or(0.0, |v| f64::from(*v)));
+        unit(parts.sum()).clamp(0.0, 1.0)
+    };
+    let lumas: Vec<f64> = (0..count).map(luma).collect();
+    let mean = lumas.iter().sum::<f64>() / count.max(1) as f64;
+    let light = |luma: f64| (luma + SHADE_FLOOR) / (mean + SHADE_FLOOR) - 1.0;
+    let shade = |value: f64| lumas.iter().map(move |luma| (2.0 * unit(value).max(0.0) * light(*luma)) as f32);
+    aim.into_iter().flat_map(shade).collect()
 }
 
 #[cfg(test)]
@@ -172,6 +325,33 @@ mod tests {
         for (colour, expected) in [([1.0, -1.0, -1.0], red), ([1.0, 1.0, 1.0], 100.0), ([-1.0; 3], 0.0)] {
             let found = perceived_difference(colour, [-1.0; 3]).unwrap();
             assert!((found - expected).abs() < 0.05, "{colour:?}: {found} {expected}");
+        }
+    }
+
+    #[test]
+    fn the_shortest_step_closes_what_is_missed() {
+        let device = candle_core::Device::Cpu;
+        let mut random = Stream::new(3, &[]);
+        let gradients: [Tensor; 3] = std::array::from_fn(|_| random.normal_tensor(&[1, 16], &device).unwrap());
+        let missed = [0.03, -0.02, 0.01];
+        let step = shortest(&gradients, missed).unwrap();
+        for (gradient, missed) in gradients.iter().zip(missed) {
+            let closed = objective::scalar(&(gradient * &step).unwrap().sum_all().unwrap()).unwrap();
+            // The damping leaves about a thousandth.
+            assert!((closed - missed).abs() < 2e-4, "{closed} {missed}");
+        }
+        let short = shortest(&gradients, missed.map(|value| 1e3 * value)).unwrap();
+        let length = objective::scalar(&short.sqr().unwrap().mean_all().unwrap()).unwrap().sqrt();
+        assert!((length - NEWTON_REACH).abs() < 1e-5, "{length}");
+    }
+
+    #[test]
+    fn shades_are_those_of_the_own_picture_and_scale_with_the_colour() {
+        let own = vec![vec![-0.2f32, 0.2], vec![-0.2, 0.2], vec![-0.2, 0.2]];
+        let found = shades(&own, [1.0, 0.0, -1.0]);
+        // Lumas 0.4 and 0.6 around 0.5: with the floor, light is 5/6 and 7/6 of the mean's.
+        for (found, expected) in found.iter().zip([-2.0 / 6.0, 2.0 / 6.0, -1.0 / 6.0, 1.0 / 6.0, 0.0, 0.0]) {
+            assert!((f64::from(*found) - expected).abs() < 1e-5, "{found} {expected}");
         }
     }
 }

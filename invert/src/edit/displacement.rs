@@ -71,6 +71,31 @@ impl Displacement {
         Ok(self.rows.as_tensor().sqr()?.mean_all()?)
     }
 
+    /// The moving rows as they are now, `[N, D]`, whitened.
+    pub(super) fn rows(&self) -> Result<Tensor> {
+        Ok(self.rows.as_tensor().copy()?.detach())
+    }
+
+    /// Moves the rows to `rows`, as [`Self::rows`] gave them.
+    pub(super) fn set(&mut self, rows: &Tensor) -> Result<()> {
+        Ok(self.rows.set(rows)?)
+    }
+
+    /// Moves the rows by `step` `[N, D]`, whitened.
+    pub(super) fn shift(&mut self, step: &Tensor) -> Result<()> {
+        let moved = (self.rows.as_tensor() + step)?.detach();
+        self.set(&moved)
+    }
+
+    /// The gradient of `value`, computed from [`Self::live`], to the moving rows: `[N, D]`.
+    pub(super) fn gradient(&self, value: &Tensor) -> Result<Tensor> {
+        let gradients = value.backward()?;
+        match gradients.get(self.rows.as_tensor()) {
+            Some(gradient) => Ok(gradient.detach()),
+            None => Ok(self.rows.as_tensor().zeros_like()?),
+        }
+    }
+
     /// One step down `loss`, which was computed from [`Self::live`].
     pub(super) fn descend(&mut self, loss: &Tensor, name: &str) -> Result<()> {
         if !objective::scalar(loss)?.is_finite() {

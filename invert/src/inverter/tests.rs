@@ -44,7 +44,7 @@ pub fn small_generator(seed: u64) -> Generator {
 }
 
 /// A portrait the generator can make, as if it were a photo.
-fn subject(generator: &Generator, with_labels: bool) -> Subject {
+pub fn subject(generator: &Generator, with_labels: bool) -> Subject {
     let codes = generator.codes_from_seed(7, 1.0).unwrap();
     let view = Camera::parameter_tensor(&[Camera::at(0.15, -0.05)], &Device::Cpu).unwrap();
     let picture = whole_picture(generator, &codes, None, &view, false).unwrap();
@@ -114,8 +114,7 @@ fn the_same_seed_gives_the_same_bytes() {
     let generator = small_generator(3);
     let bytes = |seed| {
         let config = InvertConfig { seed, pivot_steps: Some(12), tune_steps: Some(3), ..config() };
-        let (mut inversion, _) = run(&generator, subject(&generator, false), config);
-        inversion.portrait.metrics.seconds = 0.0;
+        let (inversion, _) = run(&generator, subject(&generator, false), config);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.cnerf");
         inversion.portrait.save(&path).unwrap();
@@ -306,4 +305,39 @@ fn photos_of_one_person_share_everything_but_the_camera() {
     assert_eq!((both.len(), codes(0)), (2, codes(1)));
     assert_ne!(both[0].portrait.camera, both[1].portrait.camera);
     assert!(Inverter::of_person(&generator, "small", Vec::new(), config(), None).is_err());
+}
+
+#[test]
+fn a_stopped_inversion_goes_on_to_the_same_bytes() {
+    let generator = small_generator(3);
+    let config = InvertConfig { pivot_steps: Some(16), tune_steps: Some(6), ..InvertConfig::default() };
+    let fresh = |config: &InvertConfig| {
+        Inverter::new(&generator, "small", subject(&generator, true), config.clone(), None).unwrap()
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = |mut inverter: Inverter<'_>| {
+        while inverter.step().unwrap().is_some() {}
+        let path = folder.path().join("a.cnerf");
+        inverter.finish().unwrap().portrait.save(&path).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    let whole = bytes(fresh(&config));
+    let part = checkpoint::path_of(&folder.path().join("a.cnerf"));
+    // The warning, then: within the first phase, at its end, among free rows, on whole pictures, at the pivot's end, and
+    // twice while tuning.
+    let shared = config.steps().shared;
+    for steps in [1, shared, 9, 16, 17, 18, 21] {
+        let mut stopped = fresh(&config);
+        (0..=steps).for_each(|_| drop(stopped.step().unwrap()));
+        stopped.save(&part).unwrap();
+        let mut inverter = fresh(&config);
+        inverter.resume(&part).unwrap();
+        assert_eq!(inverter.progress(), (steps, 22));
+        assert!(bytes(inverter) == whole, "stopped after {steps} steps");
+    }
+    let mut other = fresh(&InvertConfig { seed: 1, ..config.clone() });
+    let error = other.resume(&part).unwrap_err().to_string();
+    assert!(error.contains("a.cnerf.part") && error.contains("another photo"), "{error}");
+    std::fs::write(&part, b"cut off").unwrap();
+    assert!(fresh(&config).resume(&part).unwrap_err().to_string().contains("a.cnerf.part"));
 }

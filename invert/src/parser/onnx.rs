@@ -308,4 +308,4 @@ fn one_line(error: impl Into<TractError>) -> String {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

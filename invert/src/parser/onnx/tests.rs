@@ -43,7 +43,7 @@ fn attribute(name: &str, value: u64) -> Vec<u8> {
 
 /// A network of one 1x1 convolution by the identity: three classes, scored by red, green and blue. `labels` adds an
 /// arg max.
-fn identity(input: &[u64], labels: bool) -> Vec<u8> {
+pub(crate) fn identity(input: &[u64], labels: bool) -> Vec<u8> {
     const FLOAT: u64 = 1;
     const INT64: u64 = 7;
     let weights: Vec<u8> = (0..9).flat_map(|index| f32::from(u8::from(index % 4 == 0)).to_le_bytes()).collect();
