@@ -41,6 +41,7 @@ struct Store {
 pub struct Parameters {
     store: Arc<Mutex<Store>>,
     prefix: String,
+    frozen: bool,
 }
 
 impl Parameters {
@@ -56,7 +57,7 @@ impl Parameters {
 
     fn new(seed: u64, dtype: DType, device: &Device, source: Option<HashMap<String, Tensor>>) -> Self {
         let store = Store { seed, dtype, device: device.clone(), source, variables: BTreeMap::new() };
-        Self { store: Arc::new(Mutex::new(store)), prefix: String::new() }
+        Self { store: Arc::new(Mutex::new(store)), prefix: String::new(), frozen: false }
     }
 
     fn store(&self) -> MutexGuard<'_, Store> {
@@ -66,7 +67,13 @@ impl Parameters {
     /// The same weights seen from below `name`.
     #[must_use]
     pub fn within(&self, name: impl std::fmt::Display) -> Self {
-        Self { store: Arc::clone(&self.store), prefix: format!("{}{name}.", self.prefix) }
+        Self { store: Arc::clone(&self.store), prefix: format!("{}{name}.", self.prefix), frozen: self.frozen }
+    }
+
+    /// The same weights, which change as these do, for networks that gradients pass through without reaching them.
+    #[must_use]
+    pub fn frozen(&self) -> Self {
+        Self { frozen: true, ..self.clone() }
     }
 
     /// The element type of all weights.
@@ -81,6 +88,11 @@ impl Parameters {
 
     /// The weight called `name` here. The tensor shares its storage with the trainable variable.
     pub fn get(&self, name: &str, shape: &[usize], init: Init) -> Result<Tensor> {
+        let tensor = self.shared(name, shape, init)?;
+        Ok(if self.frozen { tensor.detach() } else { tensor })
+    }
+
+    fn shared(&self, name: &str, shape: &[usize], init: Init) -> Result<Tensor> {
         let name = format!("{}{name}", self.prefix);
         let mut store = self.store();
         if let Some(variable) = store.variables.get(&name) {
@@ -155,4 +167,22 @@ fn draw(seed: u64, name: &str, shape: &[usize], init: Init, device: &Device) -> 
             _ => return Err(Error::shape(name, "[.., rows, columns]", shape)),
         },
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frozen_weights_follow_their_variables_and_take_no_gradient() {
+        let parameters = Parameters::fresh(1, DType::F64, &Device::Cpu);
+        let get =
+            |parameters: &Parameters| parameters.within("layer").get("weight", &[2], Init::Constant(1.0)).unwrap();
+        let (own, frozen) = (get(&parameters), get(&parameters.frozen()));
+        let (_, variable) = parameters.variables().remove(0);
+        variable.set(&Tensor::new(&[3f64, 4.0], &Device::Cpu).unwrap()).unwrap();
+        assert_eq!(frozen.to_vec1::<f64>().unwrap(), [3.0, 4.0]);
+        let gradients = (&own * &frozen).unwrap().sum_all().unwrap().backward().unwrap();
+        assert_eq!(gradients.get(&own).unwrap().to_vec1::<f64>().unwrap(), [3.0, 4.0], "not twice");
+    }
 }

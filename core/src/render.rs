@@ -13,12 +13,14 @@ pub mod frame;
 pub mod integrate;
 pub mod plan;
 pub mod sampling;
+pub mod surface;
 pub mod trajectory;
 
 pub use crate::kernels::Outputs;
-pub use frame::{Frame, RenderSettings, TwoPass, render_frame, render_rays};
+pub use frame::{Frame, RenderSettings, render_frame, render_rays};
 pub use integrate::{RayOutput, RayWeights};
 pub use sampling::{Placement, Sampling};
+pub use surface::TwoPass;
 
 /// A field at N points of B portraits. `k` counts the volume's regions, rows in label order.
 #[derive(Clone, Debug)]

@@ -168,6 +168,8 @@ enum Path {
 enum InstructionSet {
     /// Plain Rust, four lanes.
     Portable,
+    /// Of aarch64, four lanes.
+    Neon,
     /// AVX2 and FMA, eight lanes.
     Avx2,
     /// AVX-512F, sixteen lanes.
@@ -183,7 +185,9 @@ impl InstructionSet {
             Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512 => is_x86_feature_detected!("avx512f") && Self::Avx2.available(),
-            #[cfg(not(target_arch = "x86_64"))]
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => std::arch::is_aarch64_feature_detected!("neon"),
+            #[allow(unreachable_patterns, reason = "which sets are left depends on the architecture")]
             _ => false,
         }
     }
@@ -198,6 +202,8 @@ impl InstructionSet {
             Self::Avx512 => of::<std::arch::x86_64::__m512>(),
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => of::<std::arch::x86_64::__m256>(),
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => of::<std::arch::aarch64::float32x4_t>(),
             _ => of::<crate::simd::Portable>(),
         }
     }
@@ -210,6 +216,7 @@ impl Path {
             "plain" => return Ok(Self::Plain),
             "avx512" => InstructionSet::Avx512,
             "avx2" => InstructionSet::Avx2,
+            "neon" => InstructionSet::Neon,
             _ => InstructionSet::Portable,
         };
         Ok(Self::Direct(if instruction_set.available() { instruction_set } else { InstructionSet::Portable }))

@@ -271,7 +271,8 @@ macro_rules! instruction_set {
     };
 }
 
-// Rows of a block of registers: with three vectors of columns they use 24 of AVX-512's 32 registers, 12 of 16 else.
+// Rows of a block of registers that is up to three vectors wide: their sums take 24 of 32 registers, 12 of 16 or, where
+// a multiply-add needs one more for its product, 8.
 #[cfg(target_arch = "x86_64")]
 instruction_set!(
     AVX512,
@@ -288,9 +289,19 @@ instruction_set!(
     avx2,
     "avx2",
     std::arch::x86_64::__m256,
-    4,
+    6,
     is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
     "avx2,fma"
+);
+#[cfg(target_arch = "aarch64")]
+instruction_set!(
+    NEON,
+    neon,
+    "neon",
+    std::arch::aarch64::float32x4_t,
+    8,
+    std::arch::is_aarch64_feature_detected!("neon"),
+    "neon"
 );
 instruction_set!(PORTABLE, portable, "portable", crate::simd::Portable, 4, true);
 

@@ -308,7 +308,9 @@ pub trait RegionKernel<T>: Send + Sync {
 pub fn kernels() -> impl Iterator<Item = &'static dyn RegionKernel<f32>> {
     #[cfg(target_arch = "x86_64")]
     let wide: [&dyn RegionKernel<f32>; 2] = [&fused::AVX512, &fused::AVX2];
-    #[cfg(not(target_arch = "x86_64"))]
+    #[cfg(target_arch = "aarch64")]
+    let wide: [&dyn RegionKernel<f32>; 1] = [&fused::NEON];
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     let wide: [&dyn RegionKernel<f32>; 0] = [];
     wide.into_iter().chain([&fused::PORTABLE as &dyn RegionKernel<f32>, &plain::Plain])
 }

@@ -70,6 +70,15 @@ mod x86 {
 }
 
 /// # Safety
+/// The processor has NEON.
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+unsafe fn neon(start: f32) -> f32 {
+    // SAFETY: this function's own features.
+    unsafe { stretch::<std::arch::aarch64::float32x4_t>(start) }
+}
+
+/// # Safety
 /// None is needed: plain Rust.
 unsafe fn portable(start: f32) -> f32 {
     // SAFETY: no instructions beyond the baseline.
@@ -87,6 +96,10 @@ pub fn measure(duration: Duration) -> Vec<Peak> {
         if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
             sets.push(("avx2", <std::arch::x86_64::__m256 as Lanes>::COUNT, x86::avx2));
         }
+    }
+    #[cfg(target_arch = "aarch64")]
+    if std::arch::is_aarch64_feature_detected!("neon") {
+        sets.push(("neon", <std::arch::aarch64::float32x4_t as Lanes>::COUNT, neon));
     }
     sets.push(("portable", Portable::COUNT, portable));
     sets.into_iter().map(|(name, lanes, run)| Peak { name, lanes, gflops: gflops(run, lanes, duration) }).collect()

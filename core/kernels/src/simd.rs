@@ -17,6 +17,9 @@ pub trait Lanes: Copy {
     const COUNT: usize;
     /// Whether [`Lanes::mul_add`] rounds once.
     const FUSED: bool;
+    /// Vectors of columns in a product's block of registers, at most 4. With the block's rows: as many sums as there are
+    /// registers for beside one row of the right operand and a factor, since one sum in memory halves the speed.
+    const BLOCK_VECTORS: usize;
     /// All lanes `value`.
     unsafe fn splat(value: f32) -> Self;
     /// Lanes from memory.
@@ -50,6 +53,7 @@ mod x86 {
     impl Lanes for __m512 {
         const COUNT: usize = 16;
         const FUSED: bool = true;
+        const BLOCK_VECTORS: usize = 4;
         #[inline(always)]
         unsafe fn splat(value: f32) -> Self {
             unsafe { _mm512_set1_ps(value) }
@@ -124,6 +128,7 @@ mod x86 {
     impl Lanes for __m256 {
         const COUNT: usize = 8;
         const FUSED: bool = true;
+        const BLOCK_VECTORS: usize = 2;
         #[inline(always)]
         unsafe fn splat(value: f32) -> Self {
             unsafe { _mm256_set1_ps(value) }
@@ -186,7 +191,69 @@ mod x86 {
     }
 }
 
-/// Four lanes in plain Rust, which compilers turn into NEON, SSE2 or WebAssembly vectors.
+#[cfg(target_arch = "aarch64")]
+mod aarch64 {
+    use std::arch::aarch64::*;
+
+    use super::Lanes;
+
+    // SAFETY (all blocks of this module): the caller of every method vouches for the instructions and the pointers.
+    #[allow(clippy::undocumented_unsafe_blocks)]
+    impl Lanes for float32x4_t {
+        const COUNT: usize = 4;
+        const FUSED: bool = true;
+        const BLOCK_VECTORS: usize = 4;
+        #[inline(always)]
+        unsafe fn splat(value: f32) -> Self {
+            unsafe { vdupq_n_f32(value) }
+        }
+        #[inline(always)]
+        unsafe fn load(source: *const f32) -> Self {
+            unsafe { vld1q_f32(source) }
+        }
+        #[inline(always)]
+        unsafe fn store(self, target: *mut f32) {
+            unsafe { vst1q_f32(target, self) }
+        }
+        #[inline(always)]
+        unsafe fn add(self, term: Self) -> Self {
+            unsafe { vaddq_f32(self, term) }
+        }
+        #[inline(always)]
+        unsafe fn sub(self, term: Self) -> Self {
+            unsafe { vsubq_f32(self, term) }
+        }
+        #[inline(always)]
+        unsafe fn mul(self, factor: Self) -> Self {
+            unsafe { vmulq_f32(self, factor) }
+        }
+        #[inline(always)]
+        unsafe fn mul_add(self, factor: Self, term: Self) -> Self {
+            unsafe { vfmaq_f32(term, self, factor) }
+        }
+        #[inline(always)]
+        unsafe fn neg_mul_add(self, factor: Self, term: Self) -> Self {
+            unsafe { vfmsq_f32(term, self, factor) }
+        }
+        #[inline(always)]
+        unsafe fn negate_where_odd(self, bits: Self) -> Self {
+            unsafe {
+                let sign = vshlq_n_u32::<31>(vreinterpretq_u32_f32(bits));
+                vreinterpretq_f32_u32(veorq_u32(vreinterpretq_u32_f32(self), sign))
+            }
+        }
+        #[inline(always)]
+        unsafe fn sum_rows(rows: *const f32, sums: *mut f32) {
+            unsafe {
+                let first = vpaddq_f32(vld1q_f32(rows), vld1q_f32(rows.add(4)));
+                let second = vpaddq_f32(vld1q_f32(rows.add(8)), vld1q_f32(rows.add(12)));
+                vst1q_f32(sums, vpaddq_f32(first, second));
+            }
+        }
+    }
+}
+
+/// Four lanes in plain Rust, which compilers turn into SSE2, NEON or WebAssembly vectors.
 #[derive(Clone, Copy)]
 #[repr(align(16))]
 pub struct Portable([f32; 4]);
@@ -202,6 +269,7 @@ impl Lanes for Portable {
     const COUNT: usize = 4;
     // Without the instruction, `f32::mul_add` is a slow library call.
     const FUSED: bool = cfg!(any(target_arch = "aarch64", target_feature = "fma"));
+    const BLOCK_VECTORS: usize = 2;
     #[inline(always)]
     unsafe fn splat(value: f32) -> Self {
         Self([value; 4])
@@ -373,6 +441,13 @@ mod tests {
         unsafe { check::<std::arch::x86_64::__m256>(angles) }
     }
 
+    #[cfg(target_arch = "aarch64")]
+    #[target_feature(enable = "neon")]
+    unsafe fn check_neon(angles: &[f32]) {
+        // SAFETY: this function's own features.
+        unsafe { check::<std::arch::aarch64::float32x4_t>(angles) }
+    }
+
     /// Every power-of-two scale up to the largest angle, the neighbourhoods of multiples of π/2, and an even sweep.
     fn angles() -> Vec<f32> {
         let mut angles = vec![0.0, -0.0, 1e-30, 1.0];
@@ -405,6 +480,11 @@ mod tests {
                 // SAFETY: just detected.
                 unsafe { check_avx2(&angles) };
             }
+        }
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            // SAFETY: just detected.
+            unsafe { check_neon(&angles) };
         }
     }
 }

@@ -25,8 +25,11 @@ pub const BUDGETS: [f64; 6] = [5e-4, 1e-3, 2e-3, 1.0 / 255.0, 0.01, 0.03];
 const CONVERGED_SAMPLES: usize = 1024;
 /// Samples a ray whose sums are compared to it.
 const SAMPLES: [usize; 8] = [4, 6, 8, 12, 16, 24, 48, 96];
-/// Colour samples at the surface that each number of distance samples goes with: a quarter, at least two.
-const COLOUR_SHARE: usize = 4;
+/// Samples at the surface that are compared to it: regular distances, distances where those point to, colours.
+const SURFACE_SAMPLES: [(usize, usize, usize); 8] =
+    [(2, 1, 2), (3, 1, 2), (4, 1, 2), (4, 1, 3), (4, 2, 3), (5, 3, 4), (8, 4, 6), (12, 8, 12)];
+/// Of the integral, dB: what placements are compared at.
+const ENOUGH_DB: f64 = 40.0;
 
 /// The exact frame on one path.
 #[derive(Clone, Debug, Serialize)]
@@ -71,9 +74,9 @@ pub struct BudgetReport {
 /// A sum of so many samples against the integral.
 #[derive(Clone, Debug, Serialize)]
 pub struct DiscretisationReport {
-    /// Samples a ray at which the distance is evaluated.
-    pub samples: usize,
-    /// Samples a ray at which colours are.
+    /// Samples a ray at which anything is evaluated, distance alone or colour too: the rays' mean.
+    pub samples: f64,
+    /// Samples at which colours are, of a ray that has any.
     pub colour_samples: usize,
     /// `uniform` or `surface`.
     pub placement: &'static str,
@@ -98,8 +101,10 @@ pub struct Report {
     pub exact_seconds: f64,
     /// Frames under budgets.
     pub budgeted: Vec<BudgetReport>,
-    /// Sums against the integral.
+    /// Sums against the integral; none of a scene with random weights.
     pub discretisation: Vec<DiscretisationReport>,
+    /// Samples a ray for 40 dB, uniform and at the surface, read off between those measured; none if none gets there.
+    pub samples_for_40_db: Option<[f64; 2]>,
     /// The exact frame on every path.
     pub paths: Vec<PathReport>,
     /// The kernels alone on every path.
@@ -153,8 +158,11 @@ pub fn run(
         progress(&format!("budget {budget:.4}"));
         budgeted.push(under_budget(&field, &camera, first, &exact, *budget, &exact_picture, repeats)?);
     }
-    progress("discretisation");
-    let discretisation = discretisation(&field, &camera, first, &exact, repeats.min(3), progress)?;
+    let discretisation = if scene.is_trained {
+        discretisation(&field, &camera, first, &exact, repeats.min(3), progress)?
+    } else {
+        Vec::new()
+    };
     let shape = generators::head_shape(&scene.generator.config().field);
     let generators = generators::run(shape, field.volume_regions().len(), paths, repeats, &machine, progress)?;
 
@@ -168,6 +176,9 @@ pub fn run(
         plain_seconds: plain.median_seconds,
         exact_seconds,
         budgeted,
+        samples_for_40_db: samples_for(ENOUGH_DB, &discretisation, "uniform")
+            .zip(samples_for(ENOUGH_DB, &discretisation, "surface"))
+            .map(|(uniform, surface)| [uniform, surface]),
         discretisation,
         paths: path_reports,
         generators,
@@ -227,24 +238,37 @@ fn discretisation(
     // Colours alone: features and normals of 1024 samples would only take time.
     let colours = RenderSettings { features: false, normals: false, ..exact.clone() };
     let converged = path.run(|| plan::render(field, camera, &with_samples(&colours, CONVERGED_SAMPLES)))?.frame.colour;
+    let uniform = SAMPLES.map(|samples| ("uniform", samples, None));
+    let surface = SURFACE_SAMPLES.map(|(samples, refinements, colour_samples)| {
+        ("surface", samples, Some(TwoPass { refinements, colour_samples, ..TwoPass::default() }))
+    });
     let mut reports = Vec::new();
-    for samples in SAMPLES {
-        let colour_samples = (samples / COLOUR_SHARE).max(2);
-        let two_pass = TwoPass { bins: 4 * samples.max(12), colour_samples };
-        for (placement, two_pass, colour_samples) in
-            [("uniform", None, samples), ("surface", Some(two_pass), colour_samples)]
-        {
-            progress(&format!("{samples} samples, {placement}"));
-            let settings = RenderSettings { two_pass, ..with_samples(&colours, samples) };
-            let render = || path.run(|| plan::render(field, camera, &settings));
-            let picture = render()?.frame.colour;
-            let timing = in_turns(repeats, &mut [Box::new(|| render().map(drop))])?;
-            let psnr = quality::psnr(&picture, &converged)?.first().copied().unwrap_or_default();
-            let seconds = timing.first().map_or(0.0, |timing| timing.median_seconds);
-            reports.push(DiscretisationReport { samples, colour_samples, placement, seconds, psnr });
-        }
+    for (placement, samples, two_pass) in uniform.into_iter().chain(surface) {
+        progress(&format!("{samples} samples, {placement}"));
+        let settings = RenderSettings { two_pass, ..with_samples(&colours, samples) };
+        let render = || path.run(|| plan::render(field, camera, &settings));
+        let planned = render()?;
+        let timing = in_turns(repeats, &mut [Box::new(|| render().map(drop))])?;
+        reports.push(DiscretisationReport {
+            samples: planned.report.samples_evaluated as f64 / planned.report.rays as f64,
+            colour_samples: two_pass.map_or(samples, |two_pass| two_pass.colour_samples),
+            placement,
+            seconds: timing.first().map_or(0.0, |timing| timing.median_seconds),
+            psnr: quality::psnr(&planned.frame.colour, &converged)?.first().copied().unwrap_or_default(),
+        });
     }
     Ok(reports)
+}
+
+/// Samples a ray at which pictures first get to `decibels`, by a straight line between the two that are around it.
+fn samples_for(decibels: f64, reports: &[DiscretisationReport], placement: &str) -> Option<f64> {
+    let curve: Vec<_> = reports.iter().filter(|report| report.placement == placement).collect();
+    curve.windows(2).find_map(|pair| match pair {
+        [from, to] if from.psnr < decibels && to.psnr >= decibels => {
+            Some(from.samples + (decibels - from.psnr) / (to.psnr - from.psnr) * (to.samples - from.samples))
+        }
+        _ => None,
+    })
 }
 
 /// The charts' file names.
@@ -298,7 +322,7 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
             .discretisation
             .iter()
             .filter(|sum| sum.placement == placement)
-            .map(|sum| (sum.samples as f64, sum.psnr))
+            .map(|sum| (sum.samples, sum.psnr))
             .collect(),
         mark: Mark::LineAndDots,
     };
@@ -306,15 +330,40 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
     let discretisation = LineChart {
         title: "Samples against the converged integral (1024 samples)".into(),
         subtitle,
-        x: Axis::logarithmic("samples a ray at which the distance is evaluated"),
+        x: Axis::logarithmic("samples a ray, of distance alone or of everything, mean over rays"),
         y: Axis::linear("PSNR, dB"),
         series: vec![
             placed("uniform", "uniform"),
-            placed("surface", "colours at the surface"),
+            placed("surface", "at the surface"),
             Series { name: "40 dB".into(), points: vec![(ends.0, 40.0), (ends.1, 40.0)], mark: Mark::Limit },
         ],
     }
     .svg()?;
     let roofline = generators::roofline(&report.generators, &report.machine)?;
-    Ok(CHARTS.into_iter().zip([paths, budgets, discretisation, roofline]).collect())
+    let charts = CHARTS.into_iter().zip([paths, budgets, discretisation, roofline]);
+    Ok(charts.filter(|(name, _)| *name != "discretisation.svg" || !report.discretisation.is_empty()).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_are_read_off_between_measurements() {
+        let report = |placement, samples, psnr| DiscretisationReport {
+            samples,
+            colour_samples: 1,
+            placement,
+            seconds: 0.0,
+            psnr,
+        };
+        let reports = [
+            report("uniform", 8.0, 36.0),
+            report("uniform", 12.0, 38.0),
+            report("uniform", 16.0, 42.0),
+            report("surface", 6.0, 39.0),
+        ];
+        assert_eq!(samples_for(40.0, &reports, "uniform"), Some(14.0));
+        assert_eq!(samples_for(40.0, &reports, "surface"), None);
+    }
 }

@@ -36,6 +36,8 @@ pub struct Scene {
     pub codes: Tensor,
     /// How it is rendered.
     pub settings: RenderSettings,
+    /// Whether there is a portrait to see, so that a picture's closeness to the integral means something.
+    pub is_trained: bool,
 }
 
 impl Scene {
@@ -43,7 +45,7 @@ impl Scene {
     pub fn of_model(generator: Generator, name: &str, seed: u64) -> Result<Self> {
         let codes = generator.codes_from_seed(seed, 0.7)?;
         let settings = generator.render_settings();
-        Ok(Self { name: format!("{name}, seed {seed}"), generator, codes, settings })
+        Ok(Self { name: format!("{name}, seed {seed}"), generator, codes, settings, is_trained: true })
     }
 
     /// The authors' sizes, see [`SceneKind::Reference`].
@@ -54,7 +56,8 @@ impl Scene {
         let codes = generator.codes_from_seed(seed, 1.0)?;
         // The authors' upsampler reads features: so they are rendered, though there is no upsampler here.
         let settings = RenderSettings { features: true, ..generator.render_settings() };
-        Ok(Self { name: format!("authors' sizes, random weights, seed {seed}"), generator, codes, settings })
+        let name = format!("authors' sizes, random weights, seed {seed}");
+        Ok(Self { name, generator, codes, settings, is_trained: false })
     }
 
     /// The same scene at another resolution or number of samples, where given; both at least 1.

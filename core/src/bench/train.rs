@@ -209,10 +209,7 @@ impl Runner {
         let work = &mut self.work;
         self.path.run(|| match work {
             Work::Pivot(pivot) => pivot.answer(DType::F32).map(drop),
-            Work::Generator(stage) => {
-                stage.generator_loss(0, &mut Metrics::default())?.backward()?;
-                Ok(())
-            }
+            Work::Generator(stage) => stage.generator_gradients(0, &mut Metrics::default()).map(drop),
             Work::Training { stage, next } => {
                 *next += 1;
                 stage.step(*next - 1).map(drop)

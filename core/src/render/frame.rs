@@ -1,6 +1,6 @@
 //! Whole pictures: rays are rendered in chunks, so that memory stays bounded at any resolution.
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -8,7 +8,8 @@ use crate::{
     error::{Error, Result},
     region::RegionSet,
     render::{
-        Outputs, Placement, RadianceField, RayBundle, RayOutput, RayWeights, Sampling, integrate::aggregate, plan,
+        Outputs, RadianceField, RayBundle, RayOutput, RayWeights, Sampling, TwoPass, integrate::aggregate, plan,
+        surface,
     },
     rng::Stream,
 };
@@ -23,7 +24,7 @@ pub struct RenderSettings {
     pub field_of_view_rad: f64,
     /// The rays' samples.
     pub sampling: Sampling,
-    /// Find the surface first and evaluate colours only there. Not differentiable in the geometry.
+    /// Find the surface first and evaluate colours only there, see [`surface`]. Not differentiable in the geometry.
     pub two_pass: Option<TwoPass>,
     /// Draw samples at random from this seed instead of at regular depths.
     pub perturb: Option<u64>,
@@ -67,23 +68,6 @@ impl RenderSettings {
             return Err(Error::config("budget", format!("{} is not a number of at least 0", self.budget)));
         }
         self.sampling.validate()
-    }
-}
-
-/// Rendering in two passes (recipe): distances at few samples, interpolated to fine bins, tell where the light comes
-/// from; colours are evaluated at the middles of equal shares of that light.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TwoPass {
-    /// Bins between which distances are interpolated.
-    pub bins: usize,
-    /// Colour samples per ray, each of the same weight.
-    pub colour_samples: usize,
-}
-
-impl Default for TwoPass {
-    fn default() -> Self {
-        Self { bins: 48, colour_samples: 3 }
     }
 }
 
@@ -131,12 +115,15 @@ pub(super) fn rays(cameras: &Tensor, settings: &RenderSettings) -> Result<(RayBu
     Ok((rays, depths))
 }
 
-/// Every region at every sample.
+/// Every region at every sample; and the number of samples.
 pub(super) fn render_exhaustively<F: RadianceField>(
     field: &F,
     cameras: &Tensor,
     settings: &RenderSettings,
-) -> Result<Frame> {
+) -> Result<(Frame, usize)> {
+    if settings.differentiable && settings.two_pass.is_some() {
+        return Err(Error::config("two_pass", "quantiles have no gradient; render differentiable pictures without it"));
+    }
     let (batch, resolution) = (cameras.dim(0)?, settings.resolution);
     let (rays, depths) = rays(cameras, settings)?;
     let count = resolution * resolution;
@@ -149,6 +136,7 @@ pub(super) fn render_exhaustively<F: RadianceField>(
     let field = quiet.as_ref().unwrap_or(field);
     let outputs = Outputs { gradient: settings.normals, colour: true, activations: settings.features };
 
+    let mut samples = 0;
     let mut columns: [Vec<Tensor>; 7] = Default::default();
     for start in (0..count).step_by(chunk) {
         let length = chunk.min(count - start);
@@ -156,9 +144,21 @@ pub(super) fn render_exhaustively<F: RadianceField>(
         let depths = if depths.dim(1)? == 1 { depths.clone() } else { depths.narrow(1, start, length)? };
         let output = match &settings.two_pass {
             Some(two_pass) => {
-                render_rays_in_two_passes(field, &rays, &depths, settings, two_pass, outputs, settings.regions)?
+                let (output, taken) = surface::render_rays(
+                    field,
+                    &rays,
+                    &depths,
+                    (&settings.sampling, two_pass),
+                    outputs,
+                    settings.regions,
+                )?;
+                samples += taken;
+                output
             }
-            None => render_rays(field, &rays, &depths, &settings.sampling, outputs, settings.regions)?,
+            None => {
+                samples += batch * length * settings.sampling.samples;
+                render_rays(field, &rays, &depths, &settings.sampling, outputs, settings.regions)?
+            }
         };
         let values = [
             Some(output.colour),
@@ -183,7 +183,7 @@ pub(super) fn render_exhaustively<F: RadianceField>(
     };
     let present = |parts: &[Tensor]| picture(parts)?.ok_or_else(|| Error::config("resolution", "must be at least 1"));
     let [colour, features, masks, depth, normal, point, opacity] = &columns;
-    Ok(Frame {
+    let frame = Frame {
         colour: present(colour)?,
         features: picture(features)?,
         masks: present(masks)?,
@@ -191,7 +191,8 @@ pub(super) fn render_exhaustively<F: RadianceField>(
         normal: picture(normal)?,
         point: present(point)?,
         opacity: present(opacity)?,
-    })
+    };
+    Ok((frame, samples))
 }
 
 /// Pixels of `rays` with samples at `depths` `[B, R, S]` (or 1 in place of B or R). `outputs` beyond colour cost
@@ -216,7 +217,7 @@ pub fn render_rays<F: RadianceField>(
     aggregate(field, rays, depths, weights, evaluation, background.as_ref(), shown)
 }
 
-fn background<F: RadianceField>(
+pub(super) fn background<F: RadianceField>(
     field: &F,
     rays: &RayBundle,
     outputs: Outputs,
@@ -227,116 +228,4 @@ fn background<F: RadianceField>(
     let (dtype, device) = (rays.directions.dtype(), rays.directions.device());
     let far = Tensor::full(camera::FAR, (1, 1, 1), device)?.to_dtype(dtype)?;
     field.background(&rays.points(&far)?, Some(&rays.view_directions), outputs.activations)
-}
-
-/// Pixels with distances at `depths` and colours at the light's quantiles, see [`TwoPass`].
-fn render_rays_in_two_passes<F: RadianceField>(
-    field: &F,
-    rays: &RayBundle,
-    depths: &Tensor,
-    settings: &RenderSettings,
-    two_pass: &TwoPass,
-    outputs: Outputs,
-    shown: RegionSet,
-) -> Result<RayOutput> {
-    if settings.differentiable {
-        return Err(Error::config("two_pass", "quantiles have no gradient; render differentiable pictures without it"));
-    }
-    let (batch, count) = rays.dimensions()?;
-    let (samples, dtype, device) = (depths.dim(2)?, depths.dtype(), depths.device());
-    let view = if field.sees_view() { Some(rays.view_directions_of(samples)?) } else { None };
-    let coarse = field.evaluate(&rays.points(depths)?, view.as_ref(), Outputs::default())?;
-    let distance = coarse.distance.reshape((batch, count, samples))?;
-
-    let fine = fine_bins(&settings.sampling, two_pass)?;
-    let bins = fine.regular(dtype, device)?;
-    let distance = interpolate(&distance, depths, &bins)?;
-    let lengths = fine.intervals(&bins)?.broadcast_mul(&rays.lengths()?.unsqueeze(2)?)?;
-    let light = RayWeights::new(&field.density(&distance)?, &lengths, fine.last_interval.is_none())?;
-    let depths = quantiles(&light.weights, &fine, two_pass.colour_samples)?;
-
-    let view = if field.sees_view() { Some(rays.view_directions_of(two_pass.colour_samples)?) } else { None };
-    let evaluation = field.evaluate(&rays.points(&depths)?, view.as_ref(), outputs)?;
-    let share = light.remaining.affine(-1.0 / two_pass.colour_samples as f64, 1.0 / two_pass.colour_samples as f64)?;
-    let weights = share.unsqueeze(2)?.broadcast_as(depths.shape())?.contiguous()?;
-    let weights = RayWeights { weights, remaining: light.remaining };
-    let background = background(field, rays, outputs)?;
-    aggregate(field, rays, &depths, weights, evaluation, background.as_ref(), shown)
-}
-
-/// The bins of two passes over the range of `sampling`.
-pub(super) fn fine_bins(sampling: &Sampling, two_pass: &TwoPass) -> Result<Sampling> {
-    if two_pass.bins == 0 || two_pass.colour_samples == 0 {
-        return Err(Error::config("two_pass", "bins and colour_samples must be at least 1"));
-    }
-    Ok(Sampling {
-        placement: Placement::Stratified,
-        samples: two_pass.bins,
-        last_interval: sampling.last_interval.map(|_| sampling.interval_of(two_pass.bins)),
-        ..*sampling
-    })
-}
-
-/// `values` `[B, R, S]` at increasing `depths` `[B, R, S]` (or 1s), read at `targets` `[1, 1, T]` by straight lines,
-/// constant beyond the ends: `[B, R, T]`.
-fn interpolate(values: &Tensor, depths: &Tensor, targets: &Tensor) -> Result<Tensor> {
-    let (batch, rays, samples) = values.dims3()?;
-    let depths = rows(&depths.broadcast_as(values.shape())?, samples)?;
-    let targets: Vec<f64> = targets.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?;
-    let mut read = Vec::with_capacity(batch * rays * targets.len());
-    for (values, depths) in rows(values, samples)?.iter().zip(&depths) {
-        let mut right = 0;
-        for target in &targets {
-            while right < samples && depths.get(right).is_some_and(|depth| depth < target) {
-                right += 1;
-            }
-            let left = right.saturating_sub(1);
-            let end = right.min(samples - 1);
-            let (Some(from), Some(to)) = (depths.get(left).zip(values.get(left)), depths.get(end).zip(values.get(end)))
-            else {
-                return Err(Error::shape("depths", values.len(), &[depths.len()]));
-            };
-            let span = to.0 - from.0;
-            let share = if span > 0.0 { ((target - from.0) / span).clamp(0.0, 1.0) } else { 0.0 };
-            read.push(from.1 + share * (to.1 - from.1));
-        }
-    }
-    like(read, (batch, rays, targets.len()), values)
-}
-
-/// Depths in the middle of `count` equal shares of the light that `weights` `[B, R, bins]` say comes from each bin.
-fn quantiles(weights: &Tensor, bins: &Sampling, count: usize) -> Result<Tensor> {
-    let (batch, rays, _) = weights.dims3()?;
-    let mut depths = Vec::with_capacity(batch * rays * count);
-    for light in rows(weights, bins.samples)? {
-        depths.extend(quantiles_of_ray(&light, bins, count));
-    }
-    like(depths, (batch, rays, count), weights)
-}
-
-/// [`quantiles`] of one ray, from the light of each bin.
-pub(super) fn quantiles_of_ray(light: &[f64], bins: &Sampling, count: usize) -> impl Iterator<Item = f64> {
-    // A trace of light everywhere spreads the samples of rays that meet nothing.
-    const TRACE: f64 = 1e-6;
-    let total: f64 = light.iter().map(|weight| weight + TRACE).sum();
-    let (near, interval) = (bins.near, bins.interval());
-    let (mut bin, mut passed) = (0, 0.0);
-    (0..count).map(move |share| {
-        let wanted = (share as f64 + 0.5) / count as f64 * total;
-        let here = |bin: usize| light.get(bin).map_or(0.0, |weight| weight + TRACE);
-        while passed + here(bin) < wanted && bin + 1 < light.len() {
-            passed += here(bin);
-            bin += 1;
-        }
-        let within = ((wanted - passed) / here(bin).max(1e-9)).clamp(0.0, 1.0);
-        near + interval * (bin as f64 + within)
-    })
-}
-
-fn rows(tensor: &Tensor, length: usize) -> Result<Vec<Vec<f64>>> {
-    Ok(tensor.to_dtype(DType::F64)?.contiguous()?.reshape(((), length))?.to_device(&Device::Cpu)?.to_vec2()?)
-}
-
-fn like(values: Vec<f64>, shape: (usize, usize, usize), tensor: &Tensor) -> Result<Tensor> {
-    Ok(Tensor::from_vec(values, shape, tensor.device())?.to_dtype(tensor.dtype())?)
 }

@@ -60,6 +60,7 @@ mod sequence;
 mod session;
 mod shade;
 mod state;
+mod whole;
 
 pub use local::{LocalField, LocalInitial, LocalWeights};
 pub use sequence::Sequence;
@@ -107,7 +108,7 @@ pub struct FrameReport {
     pub rays: usize,
     /// Rays x samples per ray.
     pub samples: usize,
-    /// Samples where any shape branch ran for this frame.
+    /// Samples where any shape branch ran for this frame; with [`RenderSettings::two_pass`], those of both passes.
     pub samples_evaluated: usize,
     /// (sample, region) pairs whose shape branch ran for this frame.
     pub shape_pairs_evaluated: usize,
@@ -180,15 +181,19 @@ impl Shown {
 }
 
 /// Pictures of `field` from `cameras` `[B, 6]` (see [`crate::camera::Camera::parameters`]) within
-/// [`RenderSettings::budget`] of the exhaustive ones. Fields, devices and settings that no plan covers (not f32 on the
-/// CPU, differentiable, two passes) and budgets of 0 or below what rounding takes are rendered exhaustively.
+/// [`RenderSettings::budget`] of the exhaustive ones. Budgets of 0 or below what rounding takes are rendered exhaustively:
+/// on the kernels ([`whole`]), or, as are fields, devices and settings that no plan covers (not f32 on the CPU,
+/// differentiable, two passes), by candle's tensors; both round the same sums in another order.
 ///
 /// # Errors
 /// If settings contradict each other, or shapes do not fit.
 pub fn render<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Planned> {
     let Some(fields) = fields(field, cameras, settings)? else {
-        return exhaustive(field, cameras, settings);
+        return by_tensors(field, cameras, settings);
     };
+    if is_exhaustive(settings) {
+        return exhaustive(field, fields, cameras, settings);
+    }
     let view = View::new(cameras, settings)?;
     let shown = Shown::new(settings);
     let mut parts = Parts::default();
@@ -214,30 +219,65 @@ pub fn render<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSe
     Ok(Planned { frame: parts.frame(&view)?, report })
 }
 
-/// The field of each picture as plain numbers; none if the pictures must be rendered exhaustively.
+/// Whether nothing may be left out.
+fn is_exhaustive(settings: &RenderSettings) -> bool {
+    settings.budget <= ROUNDING
+}
+
+/// The field of each picture as plain numbers; none if the pictures must be rendered by tensors.
 fn fields<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Option<Vec<LocalField>>> {
     settings.validate()?;
     let plain = matches!(cameras.device(), Device::Cpu) && cameras.dtype() == DType::F32 && !Path::is_composed()?;
-    if settings.budget <= ROUNDING || settings.differentiable || settings.two_pass.is_some() || !plain {
+    if settings.differentiable || settings.two_pass.is_some() || !plain {
         return Ok(None);
     }
     (0..cameras.dim(0)?).map(|image| field.local(image)).collect()
 }
 
-fn exhaustive<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Planned> {
-    let frame = frame::render_exhaustively(field, cameras, settings)?;
+/// Every region at every sample, on the kernels.
+fn exhaustive<F: RadianceField>(
+    field: &F,
+    fields: Vec<LocalField>,
+    cameras: &Tensor,
+    settings: &RenderSettings,
+) -> Result<Planned> {
+    let view = View::new(cameras, settings)?;
+    let shown = Shown::new(settings);
+    let mut parts = Parts::default();
+    for (image, local) in fields.into_iter().enumerate() {
+        let ready = Ready::new(local, shown.outputs())?;
+        for wave in view.waves() {
+            let chunks: Vec<Pixels> = wave
+                .par_iter()
+                .map(|range| whole::render(&ready, &view.rays(image, *range)?, &shown))
+                .collect::<Result<_>>()?;
+            for (pixels, range) in chunks.iter().zip(wave) {
+                parts.push(field, &view, image, *range, pixels)?;
+            }
+        }
+    }
+    Ok(Planned { frame: parts.frame(&view)?, report: exhaustive_report(field, cameras, settings)? })
+}
+
+/// Every region at every sample, by candle's tensors.
+fn by_tensors<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Planned> {
+    let (frame, samples_evaluated) = frame::render_exhaustively(field, cameras, settings)?;
+    let report = FrameReport { samples_evaluated, ..exhaustive_report(field, cameras, settings)? };
+    Ok(Planned { frame, report })
+}
+
+fn exhaustive_report<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<FrameReport> {
     let (rays, volume) = (cameras.dim(0)? * settings.resolution.pow(2), field.volume_regions());
     let samples = rays * settings.sampling.samples;
     let far = if volume == RegionSet::ALL { 0 } else { rays };
-    let report = FrameReport {
+    Ok(FrameReport {
         rays,
         samples,
         samples_evaluated: samples,
         shape_pairs_evaluated: samples * volume.len(),
         pairs_evaluated: samples * volume.len() + far,
         ..FrameReport::empty(Method::Exhaustive, settings.budget)
-    };
-    Ok(Planned { frame, report })
+    })
 }
 
 /// The rays of a frame.

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device, Tensor, backprop::GradStore};
 use image::RgbImage;
 
 use crate::{
@@ -54,9 +54,17 @@ pub struct FieldStage {
     average: Average,
     global: Discriminator,
     semantic: Discriminator,
+    /// The same two, for the generator's step: gradients of their weights would take as much memory as the weights.
+    judges: Judges,
     discriminators: Parameters,
     generator_optimiser: Adam,
     discriminator_optimiser: Adam,
+}
+
+/// Discriminators that gradients pass through.
+struct Judges {
+    global: Discriminator,
+    semantic: Discriminator,
 }
 
 /// Pictures the generator made up, with what they were made from.
@@ -87,16 +95,22 @@ impl FieldStage {
             }
         };
         let discriminators = Parameters::fresh(config.seed, dtype, &inputs.device);
-        let discriminator = |kind, name: &str| {
+        let discriminator = |kind, name: &str, parameters: &Parameters| {
             let config = DiscriminatorConfig {
                 kind,
                 resolution: stage.resolution,
                 channel_multiplier: stage.channel_multiplier,
             };
-            Discriminator::new(&config, &discriminators.within(name))
+            Discriminator::new(&config, &parameters.within(name))
         };
-        let global = discriminator(DiscriminatorKind::Global, "global")?;
-        let semantic = discriminator(DiscriminatorKind::Semantic, "semantic")?;
+        let pair = |parameters: &Parameters| -> Result<Judges> {
+            Ok(Judges {
+                global: discriminator(DiscriminatorKind::Global, "global", parameters)?,
+                semantic: discriminator(DiscriminatorKind::Semantic, "semantic", parameters)?,
+            })
+        };
+        let Judges { global, semantic } = pair(&discriminators)?;
+        let judges = pair(&discriminators.frozen())?;
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
         let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
         let trained = ["field", "mapping"].iter().flat_map(|name| generator.parameters().within(name).variables());
@@ -124,6 +138,7 @@ impl FieldStage {
             generator,
             global,
             semantic,
+            judges,
             discriminators,
             generator_optimiser,
             discriminator_optimiser,
@@ -215,25 +230,54 @@ impl FieldStage {
         Ok(total)
     }
 
-    /// The generator's whole loss at `step`, a scalar; its terms join `metrics`. Errs if one is not finite.
-    pub(crate) fn generator_loss(&self, step: usize, metrics: &mut Metrics) -> Result<Tensor> {
-        let config = &self.config;
+    /// The gradients of the generator's whole loss at `step`; its terms join `metrics`. Errs if one is not finite.
+    ///
+    /// The whole loss is a sum, so its gradients are too: those of one portrait's terms are taken, and its graph is gone,
+    /// before L_STD renders its four.
+    pub(crate) fn generator_gradients(&self, step: usize, metrics: &mut Metrics) -> Result<GradStore> {
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
-        let codes = self.draw_codes(&mut random)?;
-        let cameras = self.draw_cameras(&mut random);
-        let fakes =
-            self.render(&codes, &cameras, Outputs { colour: true, gradient: true, ..Outputs::default() }, &mut random)?;
+        let mut gradients = self.portrait_loss(&mut random, metrics)?.backward()?;
+        if self.config.decoupling > 0.0 {
+            let more = self.weighted_decoupling(&mut random, metrics)?.backward()?;
+            for (_, variable) in self.generator.parameters().variables() {
+                if let Some(gradient) = more.get(&variable) {
+                    let sum = match gradients.get(&variable) {
+                        Some(first) => (first + gradient)?,
+                        None => gradient.clone(),
+                    };
+                    gradients.insert(&variable, sum);
+                }
+            }
+        }
+        finite(metrics)?;
+        Ok(gradients)
+    }
+
+    fn weighted_decoupling(&self, random: &mut Stream, metrics: &mut Metrics) -> Result<Tensor> {
+        let decoupling = self.decoupling(random)?;
+        metrics.push("decoupling", scalar(&decoupling)?);
+        Ok((decoupling * self.config.decoupling)?)
+    }
+
+    /// All of the generator's loss but L_STD: one portrait before the discriminators, and its surface.
+    fn portrait_loss(&self, random: &mut Stream, metrics: &mut Metrics) -> Result<Tensor> {
+        let config = &self.config;
+        let codes = self.draw_codes(random)?;
+        let cameras = self.draw_cameras(random);
+        let outputs = Outputs { colour: true, gradient: true, ..Outputs::default() };
+        let fakes = self.render(&codes, &cameras, outputs, random)?;
         let pictures = Pictures { image: &fakes.image, masks: &fakes.masks };
         let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
-        let terms = generator_terms(&self.global, pictures, view)?;
+        let terms = generator_terms(&self.judges.global, pictures, view)?;
         metrics.push("generator", scalar(&terms.adversarial)?);
         let mut total = terms.total;
         if config.semantic > 0.0 {
-            let regions = draw_regions(config.batch, &mut random);
+            let regions = draw_regions(config.batch, random);
             let labels = class_labels(&regions, &self.device)?;
             let masks = select_masks(&fakes.masks, &regions)?;
             let pictures = Pictures { image: &fakes.image, masks: &masks };
-            let terms = generator_terms(&self.semantic, pictures, Auxiliary::Class { labels: &labels, weight: 1.0 })?;
+            let class = Auxiliary::Class { labels: &labels, weight: 1.0 };
+            let terms = generator_terms(&self.judges.semantic, pictures, class)?;
             metrics.push("generator_semantic", scalar(&terms.adversarial)?);
             total = (total + (terms.total * config.semantic)?)?;
         }
@@ -242,14 +286,7 @@ impl FieldStage {
         let minimal_surface = losses::minimal_surface(&fakes.output.evaluation.distance, MINIMAL_SURFACE_SHARPNESS)?;
         metrics.push("eikonal", scalar(&eikonal)?);
         metrics.push("minimal_surface", scalar(&minimal_surface)?);
-        total = ((total + (eikonal * config.eikonal)?)? + (minimal_surface * config.minimal_surface)?)?;
-        if config.decoupling > 0.0 {
-            let decoupling = self.decoupling(&mut random)?;
-            metrics.push("decoupling", scalar(&decoupling)?);
-            total = (total + (decoupling * config.decoupling)?)?;
-        }
-        finite(metrics)?;
-        Ok(total)
+        Ok(((total + (eikonal * config.eikonal)?)? + (minimal_surface * config.minimal_surface)?)?)
     }
 
     /// L_STD: two portraits' shape and texture rows, crossed and rendered from the same cameras.
@@ -269,7 +306,7 @@ impl FieldStage {
         let other = render(cross(&second, &second)?)?;
         let features = |image: &Tensor| match &self.perceptual {
             Some(perceptual) => perceptual.features(image),
-            None => self.global.image_features(image),
+            None => self.judges.global.image_features(image),
         };
         let renders = DecouplingRenders {
             masks: &own.masks,
@@ -299,8 +336,8 @@ impl StageRun for FieldStage {
         let loss = self.discriminators_loss(&real, step, &mut metrics)?;
         let norms = self.discriminator_optimiser.step(&loss.backward()?, 1.0)?;
         metrics.push("discriminator_norm", norms.iter().sum());
-        let loss = self.generator_loss(step, &mut metrics)?;
-        let norms = self.generator_optimiser.step(&loss.backward()?, 1.0)?;
+        let gradients = self.generator_gradients(step, &mut metrics)?;
+        let norms = self.generator_optimiser.step(&gradients, 1.0)?;
         metrics.push("generator_norm", norms.iter().sum());
         self.average.update(self.generator.parameters(), self.config.batch)?;
         Ok(metrics)
@@ -378,10 +415,8 @@ mod tests {
     }
 
     /// Compares autograd with central differences along a random direction of each group of variables.
-    fn check(title: &str, variables: Vec<(String, Var)>, loss: impl Fn() -> Tensor) {
+    fn check(title: &str, variables: Vec<(String, Var)>, gradients: &GradStore, value: impl Fn() -> f64) {
         const STEP: f64 = 1e-8;
-        let value = || loss().to_scalar::<f64>().unwrap();
-        let gradients = loss().backward().unwrap();
         let mut groups: BTreeMap<String, Vec<Var>> = BTreeMap::new();
         for (name, variable) in variables.into_iter().filter(|(name, _)| !name.starts_with("statistics")) {
             let group: Vec<&str> = name.split('.').take(2).collect();
@@ -431,10 +466,23 @@ mod tests {
         let theirs = stage(&folder.path().join("paper"), paper);
         for (form, mut stage) in [("ours", ours), ("paper", theirs)] {
             let real = stage.real(0).unwrap();
+            let value = |loss: Tensor| loss.to_scalar::<f64>().unwrap();
             let discriminators = || stage.discriminators_loss(&real, 0, &mut Metrics::default()).unwrap();
-            check(&format!("{form}, discriminators"), stage.discriminators.variables(), discriminators);
-            let generator = || stage.generator_loss(0, &mut Metrics::default()).unwrap();
-            check(&format!("{form}, generator"), stage.generator.parameters().variables(), generator);
+            let gradients = discriminators().backward().unwrap();
+            let variables = stage.discriminators.variables();
+            check(&format!("{form}, discriminators"), variables, &gradients, || value(discriminators()));
+
+            let gradients = stage.generator_gradients(0, &mut Metrics::default()).unwrap();
+            for (name, variable) in stage.discriminators.variables() {
+                assert!(gradients.get(&variable).is_none(), "{name} is not the generator's to learn");
+            }
+            let generator = || {
+                let mut random = Stream::new(stage.seed, &[STREAM, 0, 1]);
+                let portrait = stage.portrait_loss(&mut random, &mut Metrics::default()).unwrap();
+                value(portrait) + value(stage.weighted_decoupling(&mut random, &mut Metrics::default()).unwrap())
+            };
+            let variables = stage.generator.parameters().variables();
+            check(&format!("{form}, generator"), variables, &gradients, generator);
         }
     }
 }

@@ -64,10 +64,11 @@ fn summary(report: &Report) -> String {
             budget.budget, budget.seconds, budget.speedup, budget.max_error, budget.bound
         )
     }));
-    lines.extend(
-        report.discretisation.iter().map(|sum| {
-            format!("{} samples, {}: {:.1} dB in {:.4} s", sum.samples, sum.placement, sum.psnr, sum.seconds)
-        }),
-    );
+    lines.extend(report.discretisation.iter().map(|sum| {
+        format!("{:.1} samples, {}: {:.1} dB in {:.4} s", sum.samples, sum.placement, sum.psnr, sum.seconds)
+    }));
+    lines.extend(report.samples_for_40_db.map(|[uniform, surface]| {
+        format!("40 dB: {uniform:.1} samples a ray where uniform, {surface:.1} at the surface")
+    }));
     lines.join("\n")
 }

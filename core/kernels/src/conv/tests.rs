@@ -69,7 +69,7 @@ fn relative_error(found: &[f32], expected: &[f64]) -> f64 {
 }
 
 fn paths() -> impl Iterator<Item = Path> {
-    let sets = [InstructionSet::Portable, InstructionSet::Avx2, InstructionSet::Avx512];
+    let sets = [InstructionSet::Portable, InstructionSet::Neon, InstructionSet::Avx2, InstructionSet::Avx512];
     let direct = sets.into_iter().filter(|set| set.available()).map(Path::Direct);
     std::iter::once(Path::Plain).chain(direct)
 }

@@ -41,6 +41,12 @@ impl Registers for Portable {
     const VECTORS: usize = 2;
 }
 
+#[cfg(target_arch = "aarch64")]
+impl Registers for std::arch::aarch64::float32x4_t {
+    const ROWS: usize = 8;
+    const VECTORS: usize = 3;
+}
+
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::x86_64::*;
@@ -157,6 +163,11 @@ pub(super) fn on<J: Job>(instruction_set: InstructionSet, job: J) {
             // SAFETY: the processor was just asked.
             unsafe { with_avx2(job) }
         }
+        #[cfg(target_arch = "aarch64")]
+        InstructionSet::Neon if InstructionSet::Neon.available() => {
+            // SAFETY: the processor was just asked.
+            unsafe { with_neon(job) }
+        }
         // SAFETY: plain Rust, no instruction set needed.
         _ => unsafe { job.run::<Portable>() },
     }
@@ -174,6 +185,13 @@ fn with_avx512<J: Job>(job: J) {
 fn with_avx2<J: Job>(job: J) {
     // SAFETY: this function can only be reached on processors with AVX2 and FMA.
     unsafe { job.run::<std::arch::x86_64::__m256>() }
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn with_neon<J: Job>(job: J) {
+    // SAFETY: this function can only be reached on processors with NEON.
+    unsafe { job.run::<std::arch::aarch64::float32x4_t>() }
 }
 
 /// One small product: `out[m][n] = initial[m] + Σ_r Σ_k rows[m][r·row_step + k] · columns[r·column_step + offsets[k] + n]`.

@@ -13,8 +13,8 @@ use crate::simd::{Lanes, cos, sin};
 pub const TILE: usize = 48;
 /// Columns are padded to a multiple of this; the lanes of every instruction set divide it.
 pub const PADDING: usize = 16;
-/// Vectors of columns in a block of registers.
-const BLOCK_VECTORS: usize = 3;
+/// Rows of a block of registers that is four vectors wide: as many sums as eight rows of three.
+const FOUR_VECTORS_ROWS: usize = 6;
 
 /// The left operand of a product: element (row, inner) is at `start + row · row_stride + inner · inner_stride`.
 #[derive(Clone, Copy)]
@@ -31,13 +31,11 @@ pub trait Epilogue {
     unsafe fn apply<V: Lanes>(&self, at: usize, column: usize, product: V);
 }
 
-/// Vectors of the next block of columns: threes, but never a lone one where two twos will do.
+/// Vectors of the next block of columns: whole blocks, but never a lone vector behind one that could share.
 #[inline(always)]
 fn next_block<V: Lanes>(columns_left: usize) -> usize {
-    match columns_left / V::COUNT {
-        4 => 2,
-        vectors => vectors.min(BLOCK_VECTORS),
-    }
+    let vectors = columns_left / V::COUNT;
+    if vectors == V::BLOCK_VECTORS + 1 { V::BLOCK_VECTORS - 1 } else { vectors.min(V::BLOCK_VECTORS) }
 }
 
 /// Columns of the next panel of a packed matrix. Panels lie one after another, each row-major.
@@ -46,8 +44,8 @@ pub fn panel_columns<V: Lanes>(columns_left: usize) -> usize {
     next_block::<V>(columns_left) * V::COUNT
 }
 
-/// epilogue(offset + left · panels) for `rows` (a multiple of 16) x `columns` (a multiple of 16); `offset`, one value
-/// a column, may be null.
+/// epilogue(offset + left · panels) for `rows` x `columns` (a multiple of 16); `offset`, one value a column, may be null.
+/// Blocks have `ROWS` rows, or [`FOUR_VECTORS_ROWS`], which divide [`TILE`]: the last may run over, never beyond a tile.
 #[inline(always)]
 pub unsafe fn multiply<V: Lanes, const ROWS: usize, E: Epilogue>(
     rows: usize,
@@ -64,9 +62,14 @@ pub unsafe fn multiply<V: Lanes, const ROWS: usize, E: Epilogue>(
         unsafe {
             let panel = panels.add(column * left.inner);
             match vectors {
-                1 => multiply_panel::<V, ROWS, 1, E>(rows, columns, column, left, panel, offset, &epilogue),
+                4 if V::BLOCK_VECTORS == 4 => {
+                    multiply_panel::<V, FOUR_VECTORS_ROWS, 4, E>(rows, columns, column, left, panel, offset, &epilogue);
+                }
+                3 if V::BLOCK_VECTORS >= 3 => {
+                    multiply_panel::<V, ROWS, 3, E>(rows, columns, column, left, panel, offset, &epilogue);
+                }
                 2 => multiply_panel::<V, ROWS, 2, E>(rows, columns, column, left, panel, offset, &epilogue),
-                _ => multiply_panel::<V, ROWS, BLOCK_VECTORS, E>(rows, columns, column, left, panel, offset, &epilogue),
+                _ => multiply_panel::<V, ROWS, 1, E>(rows, columns, column, left, panel, offset, &epilogue),
             }
         }
         column += vectors * V::COUNT;
@@ -144,9 +147,12 @@ pub unsafe fn accumulate_outer<V: Lanes, const ROWS: usize>(
         unsafe {
             let (right, target) = (right.add(column), target.add(column));
             match vectors {
-                1 => outer_columns::<V, ROWS, 1>(outputs, columns, left, right, target),
+                4 if V::BLOCK_VECTORS == 4 => {
+                    outer_columns::<V, FOUR_VECTORS_ROWS, 4>(outputs, columns, left, right, target);
+                }
+                3 if V::BLOCK_VECTORS >= 3 => outer_columns::<V, ROWS, 3>(outputs, columns, left, right, target),
                 2 => outer_columns::<V, ROWS, 2>(outputs, columns, left, right, target),
-                _ => outer_columns::<V, ROWS, BLOCK_VECTORS>(outputs, columns, left, right, target),
+                _ => outer_columns::<V, ROWS, 1>(outputs, columns, left, right, target),
             }
         }
         column += vectors * V::COUNT;
@@ -168,6 +174,8 @@ unsafe fn outer_columns<V: Lanes, const ROWS: usize, const VECTORS: usize>(
             ROWS
         } else if rest >= 4 {
             4
+        } else if rest >= 2 {
+            2
         } else {
             1
         };
@@ -178,6 +186,7 @@ unsafe fn outer_columns<V: Lanes, const ROWS: usize, const VECTORS: usize>(
             let target = target.add(output * columns);
             match rows {
                 1 => outer_block::<V, 1, VECTORS>(columns, left, right, target),
+                2 => outer_block::<V, 2, VECTORS>(columns, left, right, target),
                 4 => outer_block::<V, 4, VECTORS>(columns, left, right, target),
                 _ => outer_block::<V, ROWS, VECTORS>(columns, left, right, target),
             }

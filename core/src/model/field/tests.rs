@@ -185,7 +185,7 @@ fn chunks_do_not_show_and_two_passes_come_close() {
     assert!(difference(chunked.features.as_ref().unwrap(), whole.features.as_ref().unwrap()) < 1e-13);
     let two_pass = RenderSettings {
         sampling: Sampling::behind_the_surface(16),
-        two_pass: Some(TwoPass { bins: 96, colour_samples: 24 }),
+        two_pass: Some(TwoPass { bins: 96, refinements: 4, colour_samples: 24 }),
         ..settings
     };
     let fast = frame(&field, &codes, &two_pass);

@@ -61,6 +61,20 @@ impl Rays {
         self.directions.len()
     }
 
+    /// Some of them.
+    pub fn part(&self, rays: std::ops::Range<usize>) -> Self {
+        let samples = rays.start * self.samples..rays.end * self.samples;
+        Self {
+            origin: self.origin,
+            directions: self.directions[rays.clone()].to_vec(),
+            views: self.views[rays].to_vec(),
+            samples: self.samples,
+            depths: self.depths[samples.clone()].to_vec(),
+            lengths: self.lengths[samples].to_vec(),
+            closed: self.closed,
+        }
+    }
+
     /// The world point of a sample, numbered ray by ray.
     pub fn point(&self, sample: usize) -> [f32; 3] {
         let (direction, depth) = (self.directions[sample / self.samples], self.depths[sample]);

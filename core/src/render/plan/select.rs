@@ -127,6 +127,20 @@ pub fn select(field: &Ready, rays: &Rays, marched: &Marched, shown: &Shown, budg
     selection
 }
 
+impl Selection {
+    /// Every pair of every one of `samples`, which are all, and the background if it is shown.
+    pub fn of_everything(field: &Ready, rays: &Rays, shown: &Shown, samples: Vec<u32>) -> Self {
+        let seen = field.background.is_some() && shown.regions.contains(crate::region::Region::Background);
+        let background = if seen { 0..rays.count() as u32 } else { 0..0 };
+        Self {
+            left_out: vec![0; samples.len()],
+            samples: vec![samples; field.regions.len()],
+            background: background.collect(),
+            bounds: vec![0.0; rays.count()],
+        }
+    }
+}
+
 /// What leaving a region out charges per unit of weight.
 struct Charges {
     /// Per region: R_i / 4, or 0 where the region is not shown.

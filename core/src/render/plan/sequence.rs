@@ -7,16 +7,18 @@ use crate::{
     camera,
     error::Result,
     render::{
-        RadianceField, RenderSettings, TwoPass, frame,
+        RadianceField, RenderSettings, TwoPass,
         plan::{
-            CUT_SHARE, Chunk, FrameReport, Method, Parts, Planned, Shown, View, exhaustive, fields,
+            CUT_SHARE, Chunk, FrameReport, Method, Parts, Planned, Shown, View, by_tensors, fields,
             grid::{Grid, Place},
+            is_exhaustive,
             local::{LocalField, LocalInitial, Ready, length},
             march::{Light, Marched},
             rays::Rays,
             render, select, shade,
             state::{ChunkState, Room},
         },
+        surface,
     },
 };
 
@@ -56,7 +58,7 @@ impl Sequence {
         let plannable = RenderSettings { two_pass: None, ..settings.clone() };
         let first = fields(field, &cameras.narrow(0, 0, 1)?, &plannable)?.and_then(|fields| fields.into_iter().next());
         let shared = match first {
-            Some(local) if is_shareable(&local) => {
+            Some(local) if is_shareable(&local) && !is_exhaustive(settings) => {
                 let ready = Ready::new(local, Shown::new(settings).outputs())?;
                 let (low, high) = extent(cameras, settings)?;
                 let grid = Grid::new(&ready, low, high, (settings.budget * REGION_SHARE) as f32)?;
@@ -84,7 +86,7 @@ impl Sequence {
     pub fn render<F: RadianceField>(&self, field: &F, cameras: &Tensor) -> Result<Planned> {
         let Some(shared) = &self.shared else {
             return match self.settings.two_pass {
-                Some(_) => exhaustive(field, cameras, &self.settings),
+                Some(_) => by_tensors(field, cameras, &self.settings),
                 None => render(field, cameras, &self.settings),
             };
         };
@@ -262,7 +264,7 @@ impl Shared {
         two_pass: &TwoPass,
         room: &mut Room,
     ) -> Result<(Rays, ChunkState, Marched)> {
-        let fine = frame::fine_bins(&settings.sampling, two_pass)?;
+        let fine = two_pass.bins_of(&settings.sampling)?;
         let (bins, samples, regions) = (fine.samples, two_pass.colour_samples, self.ready.regions.len());
         let mut depths = Vec::with_capacity(rays.count() * samples);
         let mut remaining = Vec::with_capacity(rays.count());
@@ -279,7 +281,7 @@ impl Shared {
                 *weight = f64::from(passed);
             }
             remaining.push(if rays.closed { 0.0 } else { light.left() });
-            depths.extend(frame::quantiles_of_ray(&light_of_bins, &fine, samples).map(|depth| depth as f32));
+            depths.extend(surface::quantiles_of_ray(&light_of_bins, &fine, samples).map(|depth| depth as f32));
         }
         rays.samples = samples;
         rays.depths = depths;

@@ -8,9 +8,10 @@ use crate::{
     render::{
         RadianceField, RenderSettings,
         plan::{
-            Chunk, FrameReport, LocalField, LocalInitial, LocalWeights, Method, Parts, Planned, Shown, View,
-            exhaustive, fields,
+            Chunk, FrameReport, LocalField, LocalInitial, LocalWeights, Method, Parts, Planned, Shown, View, fields,
+            is_exhaustive,
             local::Ready,
+            render,
             state::{ChunkState, INITIAL_BIT},
         },
     },
@@ -56,8 +57,8 @@ impl Session {
     /// As [`super::render`].
     pub fn render<F: RadianceField>(&mut self, field: &F) -> Result<Planned> {
         let settings = &self.view.settings;
-        let Some(fields) = fields(field, &self.cameras, settings)? else {
-            return exhaustive(field, &self.cameras, settings);
+        let Some(fields) = fields(field, &self.cameras, settings)?.filter(|_| !is_exhaustive(settings)) else {
+            return render(field, &self.cameras, settings);
         };
         let shown = Shown::new(settings);
         let budget = settings.budget;

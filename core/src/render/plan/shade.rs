@@ -24,6 +24,7 @@ const UNCERTAIN: f32 = 2.0;
 const TRACE: f32 = 1e-9;
 
 /// A chunk's pixels, ray by ray.
+#[derive(Default)]
 pub struct Pixels {
     /// `[n, 3]` in [0, 1].
     pub colour: Vec<f32>,
@@ -39,6 +40,24 @@ pub struct Pixels {
     pub opacity: Vec<f32>,
     /// (sample, region) pairs whose texture branch ran, those of the background included.
     pub pairs: usize,
+}
+
+impl Pixels {
+    /// More rays behind these.
+    pub fn append(&mut self, more: Self) {
+        let columns = [
+            (&mut self.colour, more.colour),
+            (&mut self.activations, more.activations),
+            (&mut self.masks, more.masks),
+            (&mut self.depth, more.depth),
+            (&mut self.normal, more.normal),
+            (&mut self.opacity, more.opacity),
+        ];
+        for (column, more) in columns {
+            column.extend(more);
+        }
+        self.pairs += more.pairs;
+    }
 }
 
 /// Evaluates the selected pairs and sums everything along the rays.

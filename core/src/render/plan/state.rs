@@ -96,6 +96,31 @@ impl ChunkState {
         size_of::<f32>() * (self.raw.len() + self.initial.len() + heads) + size_of::<u16>() * self.known.len()
     }
 
+    /// Forgets everything.
+    pub fn forget(&mut self) {
+        self.known.fill(0);
+        self.heads.iter_mut().for_each(HeadStore::clear);
+    }
+
+    /// Runs every region whole at `samples`: shape branches, and texture branches with all that the heads give.
+    pub fn fill_heads(&mut self, field: &Ready, rays: &Rays, samples: &[u32], room: &mut Room) -> Result<()> {
+        let regions = field.regions.len();
+        for (region, (store, heads)) in self.heads.iter_mut().zip(&field.heads).enumerate() {
+            store.fill(heads.as_ref(), rays, samples, &mut room.inputs)?;
+            let rows = heads.rows();
+            for sample in samples {
+                let values = store.at(*sample, rows.count);
+                let raw = [values[rows.mask], values[rows.residual]];
+                let sample = *sample as usize;
+                self.raw[(sample * regions + region) * 2..][..2].copy_from_slice(&raw);
+                self.known[sample] |= 1 << region;
+            }
+        }
+        // Every region is known by now: this runs the initial network alone.
+        self.fill_shapes(field, rays, samples, |_| 0, room)?;
+        Ok(())
+    }
+
     /// Forgets what depends on a region's shape.
     pub fn forget_shape(&mut self, bit: u16) {
         self.known.iter_mut().for_each(|known| *known &= !bit);
