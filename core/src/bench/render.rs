@@ -27,7 +27,7 @@ const CONVERGED_SAMPLES: usize = 1024;
 const SAMPLES: [usize; 8] = [4, 6, 8, 12, 16, 24, 48, 96];
 /// Samples at the surface that are compared to it: regular distances, distances where those point to, colours.
 const SURFACE_SAMPLES: [(usize, usize, usize); 8] =
-    [(2, 1, 2), (3, 1, 2), (4, 1, 2), (4, 1, 3), (4, 2, 3), (5, 3, 4), (8, 4, 6), (12, 8, 12)];
+    [(3, 1, 1), (3, 1, 2), (4, 1, 2), (4, 2, 2), (4, 2, 3), (8, 2, 3), (8, 4, 6), (12, 8, 12)];
 /// Of the integral, dB: what placements are compared at.
 const ENOUGH_DB: f64 = 40.0;
 

@@ -24,7 +24,8 @@ pub struct RenderSettings {
     pub field_of_view_rad: f64,
     /// The rays' samples.
     pub sampling: Sampling,
-    /// Find the surface first and evaluate colours only there, see [`surface`]. Not differentiable in the geometry.
+    /// Find the surface first and evaluate colours only there, see [`surface`]. Not differentiable in the geometry; its
+    /// first samples are at regular depths whatever `perturb`.
     pub two_pass: Option<TwoPass>,
     /// Draw samples at random from this seed instead of at regular depths.
     pub perturb: Option<u64>,
@@ -136,18 +137,26 @@ pub(super) fn render_exhaustively<F: RadianceField>(
     let field = quiet.as_ref().unwrap_or(field);
     let outputs = Outputs { gradient: settings.normals, colour: true, activations: settings.features };
 
-    let mut samples = 0;
+    // Samples at the surface choose their places themselves, from the same first depths for all rays.
+    let first = match settings.two_pass {
+        Some(_) => {
+            let depths = settings.sampling.regular(cameras.dtype(), cameras.device())?;
+            Some(surface::FirstSamples::new(field, &rays, &depths, resolution)?)
+        }
+        None => None,
+    };
+    let mut samples = first.as_ref().map_or(0, |first| first.taken);
     let mut columns: [Vec<Tensor>; 7] = Default::default();
     for start in (0..count).step_by(chunk) {
         let length = chunk.min(count - start);
         let rays = rays.narrow(start, length)?;
         let depths = if depths.dim(1)? == 1 { depths.clone() } else { depths.narrow(1, start, length)? };
-        let output = match &settings.two_pass {
-            Some(two_pass) => {
+        let output = match settings.two_pass.as_ref().zip(first.as_ref()) {
+            Some((two_pass, first)) => {
                 let (output, taken) = surface::render_rays(
                     field,
                     &rays,
-                    &depths,
+                    (first, start),
                     (&settings.sampling, two_pass),
                     outputs,
                     settings.regions,

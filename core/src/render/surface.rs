@@ -1,6 +1,8 @@
 //! Samples where the surface is, for pictures that nobody differentiates: distances at few regular depths tell where light
 //! may come from, distances there tell where it does, and colours are evaluated there alone.
 //!
+//! First distances are evaluated for every other pixel of every other row and are straight lines between them, as long as
+//! pixels are closer together than first samples; later samples, which are at the surface, are each ray's own.
 //! Between its samples a ray's distance is a straight line, read at fine bins. Colours are straight lines too, from one
 //! colour sample to the next, so a sample counts with the light of the bins it is nearest to, by the distances that
 //! colour samples give on the way: twice the decibels of equal shares. Rays that no light can come from end early.
@@ -53,8 +55,10 @@ impl TwoPass {
 
 /// Rays that give less light than this, of 1, count as empty: half of what a screen shows.
 const FAINT: f64 = 0.002;
-/// How much of the light that could still come from between two samples draws samples, beside that of straight lines.
-const DOUBT: f64 = 0.5;
+/// How far cautious distances are from straight lines towards the least that they can be.
+const CAUTION: f64 = 0.7;
+/// Samples evaluated at once.
+const POINTS_AT_ONCE: usize = 1 << 14;
 
 /// What is known of one ray.
 struct Probed {
@@ -88,13 +92,14 @@ impl Probed {
         })
     }
 
-    /// Halfway from straight lines to the least that a distance, which changes by no more than one is moved, can be.
+    /// [`CAUTION`] of the way from straight lines to the least that a distance, which changes by no more than one is moved,
+    /// can be.
     fn cautious(&self, depths: impl Iterator<Item = f64> + Clone) -> impl Iterator<Item = f64> {
         let least = depths.clone().map(|depth| {
             let bounds = self.samples.iter().map(|sample| sample.1 - self.length * (depth - sample.0).abs());
             bounds.fold(f64::NEG_INFINITY, f64::max)
         });
-        self.straight(depths).zip(least).map(|(straight, least)| 0.5 * (straight + least))
+        self.straight(depths).zip(least).map(|(straight, least)| straight + CAUTION * (least - straight))
     }
 }
 
@@ -142,36 +147,41 @@ impl Light {
     }
 }
 
+/// Whether a ray's light is worth samples. What is not a number is: it must show.
+fn is_lit(light: f64) -> bool {
+    light > FAINT || light.is_nan()
+}
+
 /// The middle of a bin.
 fn middle(fine: &Sampling, bin: usize) -> f64 {
     fine.near + fine.interval() * (bin as f64 + 0.5)
 }
 
-/// Pixels of `rays` with first distances at `depths` `[B, R, S]` (or 1 in place of B or R) and colours at the surface,
-/// and how many samples it took, of distance alone or of everything.
+/// Pixels of `rays`, which are those of a picture from `first_ray` on, with colours at the surface; and how many samples it
+/// took beyond the first, of distance alone or of everything.
 pub(super) fn render_rays<F: RadianceField>(
     field: &F,
     rays: &RayBundle,
-    depths: &Tensor,
+    (first, first_ray): (&FirstSamples, usize),
     (sampling, two_pass): (&Sampling, &TwoPass),
     outputs: Outputs,
     shown: RegionSet,
 ) -> Result<(RayOutput, usize)> {
     let (batch, count) = rays.dimensions()?;
-    let (dtype, device) = (depths.dtype(), depths.device().clone());
+    let (dtype, device) = (rays.directions.dtype(), rays.directions.device().clone());
     let fine = two_pass.bins_of(sampling)?;
     let light = |rays: &[Probed], cautious: bool| Light::of(field, &fine, rays, cautious, (dtype, &device));
 
-    let mut lit = first_samples(field, rays, depths)?;
-    let mut samples = lit.len() * depths.dim(2)?;
+    let mut lit = first.of(rays, first_ray)?;
+    let mut samples = 0;
     if two_pass.refinements > 0 {
         let (likely, possible) = (light(&lit, false)?, light(&lit, true)?);
         let mut drawn = Vec::with_capacity(lit.len());
         let mut index = 0;
         lit.retain(|_| {
-            let keep = likely.given(index).max(possible.given(index)) > FAINT;
+            let keep = is_lit(likely.given(index)) || is_lit(possible.given(index));
             if let (true, Some(likely), Some(possible)) = (keep, likely.bins.get(index), possible.bins.get(index)) {
-                let light: Vec<f64> = likely.iter().zip(possible).map(|(sure, may)| sure + DOUBT * may).collect();
+                let light: Vec<f64> = likely.iter().zip(possible).map(|(sure, may)| sure + may).collect();
                 drawn.extend(quantiles_of_ray(&light, &fine, two_pass.refinements));
             }
             index += 1;
@@ -184,7 +194,7 @@ pub(super) fn render_rays<F: RadianceField>(
     let mut drawn = Vec::with_capacity(lit.len() * two_pass.colour_samples);
     let mut index = 0;
     lit.retain(|_| {
-        let bins = likely.bins.get(index).filter(|_| likely.given(index) > FAINT);
+        let bins = likely.bins.get(index).filter(|_| is_lit(likely.given(index)));
         drawn.extend(bins.into_iter().flat_map(|bins| quantiles_of_ray(bins, &fine, two_pass.colour_samples)));
         index += 1;
         bins.is_some()
@@ -234,26 +244,95 @@ pub(super) fn render_rays<F: RadianceField>(
     Ok((output, samples))
 }
 
-/// All rays with their distances at `depths`.
-fn first_samples<F: RadianceField>(field: &F, rays: &RayBundle, depths: &Tensor) -> Result<Vec<Probed>> {
-    let (batch, count) = rays.dimensions()?;
-    let samples = depths.dim(2)?;
-    let view = if field.sees_view() { Some(rays.view_directions_of(samples)?) } else { None };
-    let distances = field.evaluate(&rays.points(depths)?, view.as_ref(), Outputs::default())?.distance;
-    let rows = |tensor: &Tensor| -> Result<Vec<Vec<f64>>> {
-        Ok(tensor.to_dtype(DType::F64)?.contiguous()?.reshape((batch * count, samples))?.to_vec2()?)
+/// Distances of all rays of a picture at the same few depths.
+pub(super) struct FirstSamples {
+    depths: Vec<f64>,
+    /// Per picture and ray.
+    distances: Vec<Vec<Vec<f64>>>,
+    /// How many were evaluated.
+    pub taken: usize,
+}
+
+impl FirstSamples {
+    /// At `depths` `[1, 1, S]` of `rays`, those of all pixels in row order.
+    pub fn new<F: RadianceField>(field: &F, rays: &RayBundle, depths: &Tensor, resolution: usize) -> Result<Self> {
+        let (batch, _) = rays.dimensions()?;
+        let samples = depths.dim(2)?;
+        let depth_values: Vec<f64> = depths.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?;
+        let between_samples = depth_values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
+        let step = if 2.0 * pixel_distance(rays)? <= between_samples { 2 } else { 1 };
+        let chosen: Vec<u32> = (0..resolution)
+            .step_by(step)
+            .flat_map(|row| (0..resolution).step_by(step).map(move |column| (row * resolution + column) as u32))
+            .collect();
+        let mut distances = vec![Vec::with_capacity(chosen.len()); batch];
+        for chosen in chosen.chunks((POINTS_AT_ONCE / (batch * samples).max(1)).max(1)) {
+            let chosen = Tensor::new(chosen, rays.directions.device())?;
+            let rays = RayBundle {
+                origins: rays.origins.clone(),
+                directions: rays.directions.contiguous()?.index_select(&chosen, 1)?,
+                view_directions: rays.view_directions.contiguous()?.index_select(&chosen, 1)?,
+            };
+            let view = if field.sees_view() { Some(rays.view_directions_of(samples)?) } else { None };
+            let found = field.evaluate(&rays.points(depths)?, view.as_ref(), Outputs::default())?.distance;
+            let found = found.to_dtype(DType::F64)?.reshape((batch, (), samples))?.to_vec3()?;
+            distances.iter_mut().zip(found).for_each(|(distances, found)| distances.extend(found));
+        }
+        let taken = batch * chosen.len() * samples;
+        if step == 2 {
+            distances = distances.iter().map(|grid| doubled(grid, resolution)).collect();
+        }
+        Ok(Self { depths: depth_values, distances, taken })
+    }
+
+    /// What is known of `rays`, the picture's from `first_ray` on.
+    fn of(&self, rays: &RayBundle, first_ray: usize) -> Result<Vec<Probed>> {
+        let lengths: Vec<Vec<f64>> = rays.lengths()?.to_dtype(DType::F64)?.to_vec2()?;
+        let images = self.distances.iter().zip(lengths).enumerate();
+        let probed = images.flat_map(|(image, (distances, lengths))| {
+            let rays = distances.iter().skip(first_ray).zip(lengths).enumerate();
+            rays.map(move |(ray, (distances, length))| Probed {
+                image,
+                ray,
+                length,
+                samples: self.depths.iter().copied().zip(distances.iter().copied()).collect(),
+            })
+        });
+        Ok(probed.collect())
+    }
+}
+
+/// How far neighbouring rays are apart at most, world units at unit depth; none where there is one ray.
+fn pixel_distance(rays: &RayBundle) -> Result<f64> {
+    let (_, count) = rays.dimensions()?;
+    if count < 2 {
+        return Ok(f64::INFINITY);
+    }
+    let step = (rays.directions.narrow(1, 1, 1)? - rays.directions.narrow(1, 0, 1)?)?;
+    Ok(crate::render::norm(&step)?.to_dtype(DType::F64)?.max_all()?.to_scalar()?)
+}
+
+/// A grid of rows of values at even pixels, row by row, as one of all `resolution`² pixels: straight lines between and,
+/// on the far edge of an even resolution, beyond.
+fn doubled(grid: &[Vec<f64>], resolution: usize) -> Vec<Vec<f64>> {
+    let side = resolution.div_ceil(2);
+    // The two even pixels that an odd one is on the line of, and the second's share.
+    let line = |pixel: usize| match pixel / 2 {
+        before if pixel.is_multiple_of(2) => (before, before, 0.0),
+        before if before + 1 < side => (before, before + 1, 0.5),
+        before => (before.saturating_sub(1), before, if before > 0 { 1.5 } else { 1.0 }),
     };
-    let distances = rows(&distances)?;
-    let depths = rows(&depths.broadcast_as((batch, count, samples))?)?;
-    let lengths: Vec<f64> = rays.lengths()?.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?;
-    let known = distances.into_iter().zip(depths).zip(lengths).enumerate();
-    let known = known.map(|(index, ((distances, depths), length))| Probed {
-        image: index / count.max(1),
-        ray: index % count.max(1),
-        length,
-        samples: depths.into_iter().zip(distances).collect(),
-    });
-    Ok(known.collect())
+    let mut all = Vec::with_capacity(resolution * resolution);
+    for (top, bottom, down) in (0..resolution).map(line) {
+        for (left, right, along) in (0..resolution).map(line) {
+            let corner = |row: usize, column: usize| grid.get(row * side + column).into_iter().flatten();
+            let upper = corner(top, left).zip(corner(top, right)).map(|(left, right)| left + along * (right - left));
+            let lower =
+                corner(bottom, left).zip(corner(bottom, right)).map(|(left, right)| left + along * (right - left));
+            all.push(upper.zip(lower).map(|(upper, lower)| upper + down * (lower - upper)).collect());
+        }
+    }
+    all
 }
 
 /// Samples of some rays, the same number of each, as one list a picture, padded to the longest.
@@ -418,6 +497,24 @@ pub(super) fn quantiles_of_ray(light: &[f64], bins: &Sampling, count: usize) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn distances_between_pixels_are_on_straight_lines() {
+        for resolution in [1, 2, 5, 8] {
+            let value = |row: usize, column: usize| 3.0 * row as f64 - 0.5 * column as f64 + 1.0;
+            let even: Vec<Vec<f64>> = (0..resolution)
+                .step_by(2)
+                .flat_map(|row| (0..resolution).step_by(2).map(move |column| vec![value(row, column), 7.0]))
+                .collect();
+            let found = doubled(&even, resolution);
+            assert_eq!(found.len(), resolution * resolution);
+            for (pixel, found) in found.iter().enumerate() {
+                // With a single even pixel there is no line to go on by.
+                let expected = if resolution < 3 { value(0, 0) } else { value(pixel / resolution, pixel % resolution) };
+                assert!((found[0] - expected).abs() < 1e-12 && found[1] == 7.0, "{resolution} {pixel} {found:?}");
+            }
+        }
+    }
 
     #[test]
     fn light_is_shared_out_whole_and_by_nearness() {

@@ -108,7 +108,8 @@ pub struct WarmupConfig {
     pub pixel_jitter: f64,
     /// Loss weights.
     pub weights: WarmupWeights,
-    /// Share of the points at which the eikonal loss is taken.
+    /// Share of the points at which the eikonal loss is taken. They are drawn evenly, so the loss and its gradient are
+    /// unbiased: in expectation the mean over all points.
     pub eikonal_share: f64,
 }
 

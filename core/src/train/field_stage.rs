@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use candle_core::{DType, Device, Tensor, backprop::GradStore};
+use candle_core::{DType, Device, Tensor, Var, backprop::GradStore};
 use image::RgbImage;
 
 use crate::{
@@ -167,7 +167,9 @@ impl FieldStage {
         (0..self.config.batch).map(|_| Camera::at(draw(azimuth), draw(elevation))).collect()
     }
 
-    /// Renders codes `[B, 9, 2, D]`; with `outputs.gradient` for the eikonal loss.
+    /// Renders codes `[B, 9, 2, D]`; with `outputs.gradient` for the eikonal loss. Every region at every sample: what a
+    /// plan leaves out of a picture would be missing from its gradient, and nothing bounds that. The discriminators'
+    /// pictures and the generator's are drawn apart, as the authors' are.
     fn render(&self, codes: &Tensor, cameras: &[Camera], outputs: Outputs, random: &mut Stream) -> Result<Fakes> {
         let settings = RenderSettings { resolution: self.config.resolution, ..self.generator.render_settings() };
         let sampling = Sampling { samples: self.config.samples, ..settings.sampling };
@@ -266,20 +268,23 @@ impl FieldStage {
         let cameras = self.draw_cameras(random);
         let outputs = Outputs { colour: true, gradient: true, ..Outputs::default() };
         let fakes = self.render(&codes, &cameras, outputs, random)?;
-        let pictures = Pictures { image: &fakes.image, masks: &fakes.masks };
-        let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
-        let terms = generator_terms(&self.judges.global, pictures, view)?;
-        metrics.push("generator", scalar(&terms.adversarial)?);
-        let mut total = terms.total;
+        let mut total = through([&fakes.image, &fakes.masks], |[image, masks]| {
+            let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
+            let terms = generator_terms(&self.judges.global, Pictures { image, masks }, view)?;
+            metrics.push("generator", scalar(&terms.adversarial)?);
+            Ok(terms.total)
+        })?;
         if config.semantic > 0.0 {
             let regions = draw_regions(config.batch, random);
             let labels = class_labels(&regions, &self.device)?;
             let masks = select_masks(&fakes.masks, &regions)?;
-            let pictures = Pictures { image: &fakes.image, masks: &masks };
-            let class = Auxiliary::Class { labels: &labels, weight: 1.0 };
-            let terms = generator_terms(&self.judges.semantic, pictures, class)?;
-            metrics.push("generator_semantic", scalar(&terms.adversarial)?);
-            total = (total + (terms.total * config.semantic)?)?;
+            let loss = through([&fakes.image, &masks], |[image, masks]| {
+                let class = Auxiliary::Class { labels: &labels, weight: 1.0 };
+                let terms = generator_terms(&self.judges.semantic, Pictures { image, masks }, class)?;
+                metrics.push("generator_semantic", scalar(&terms.adversarial)?);
+                Ok((terms.total * config.semantic)?)
+            })?;
+            total = (total + loss)?;
         }
         let gradient = fakes.output.evaluation.gradient.as_ref();
         let eikonal = losses::eikonal(gradient.ok_or_else(|| Error::config("gradient", "the field gave none"))?)?;
@@ -308,14 +313,12 @@ impl FieldStage {
             Some(perceptual) => perceptual.features(image),
             None => self.judges.global.image_features(image),
         };
-        let renders = DecouplingRenders {
-            masks: &own.masks,
-            masks_other_texture: &other_texture.masks,
-            picture: &own.image,
-            picture_other_shape: &other_shape.image,
-            picture_other_both: &other.image,
-        };
-        losses::shape_texture_decoupling(renders, features, self.config.decoupling_margin)
+        let pictures = [&own.masks, &other_texture.masks, &own.image, &other_shape.image, &other.image];
+        through(pictures, |[masks, masks_other_texture, picture, picture_other_shape, picture_other_both]| {
+            let renders =
+                DecouplingRenders { masks, masks_other_texture, picture, picture_other_shape, picture_other_both };
+            losses::shape_texture_decoupling(renders, features, self.config.decoupling_margin)
+        })
     }
 
     /// Codes of fresh portraits, mixed from two w with the configured chance.
@@ -371,6 +374,28 @@ impl StageRun for FieldStage {
     }
 }
 
+/// `loss` of `pictures` when its graph, that of a network above them, is gone already: the value of the loss and, to the
+/// pictures, its gradient.
+fn through<const N: usize>(
+    pictures: [&Tensor; N],
+    loss: impl FnOnce([&Tensor; N]) -> Result<Tensor>,
+) -> Result<Tensor> {
+    let leaves = pictures.iter().map(|picture| Var::from_tensor(&picture.detach()));
+    let leaves = leaves.collect::<candle_core::Result<Vec<_>>>()?;
+    let mut tensors = pictures;
+    tensors.iter_mut().zip(&leaves).for_each(|(tensor, leaf)| *tensor = leaf.as_tensor());
+    let loss = loss(tensors)?;
+    let gradients = loss.backward()?;
+    let mut total = loss.detach();
+    for (picture, leaf) in pictures.into_iter().zip(&leaves) {
+        if let Some(gradient) = gradients.get(leaf) {
+            let nothing = (picture - picture.detach())?;
+            total = (total + (nothing * gradient.detach())?.sum_all()?)?;
+        }
+    }
+    Ok(total)
+}
+
 fn draw_regions(count: usize, random: &mut Stream) -> Vec<Region> {
     (0..count).map(|_| Region::ALL[random.below(Region::ALL.len())]).collect()
 }
@@ -389,8 +414,6 @@ fn finite(metrics: &Metrics) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-
-    use candle_core::Var;
 
     use super::*;
     use crate::train::{config::Preset, test_data::dataset};

@@ -15,7 +15,7 @@ const NONE: u32 = u32::MAX;
 pub struct HeadStore {
     /// Per sample, where its values lie among `values`.
     slots: Vec<u32>,
-    /// One point's C values after another's.
+    /// One point's C values after another's; behind the last that is known, what was known before.
     values: Vec<f32>,
     count: usize,
 }
@@ -24,7 +24,6 @@ impl HeadStore {
     /// Forgets everything.
     pub fn clear(&mut self) {
         self.slots.fill(NONE);
-        self.values.clear();
         self.count = 0;
     }
 
@@ -51,8 +50,10 @@ impl HeadStore {
             }
         }
         let width = region.rows().count;
-        self.values.resize(self.count * width, 0.0);
-        region.forward(inputs, &mut self.values[before * width..])?;
+        if self.values.len() < self.count * width {
+            self.values.resize(self.count * width, 0.0);
+        }
+        region.forward(inputs, &mut self.values[before * width..self.count * width])?;
         Ok(self.count - before)
     }
 
