@@ -136,7 +136,8 @@ mod tests {
         let peaks = measure(Duration::from_millis(20));
         assert_eq!(peaks.last().map(|peak| peak.name), Some("portable"));
         for peak in peaks {
-            assert!(peak.gflops > 0.1 && peak.gflops.is_finite(), "{peak:?}");
+            // Emulators have a ceiling too, a low one.
+            assert!(peak.gflops > 1e-3 && peak.gflops.is_finite(), "{peak:?}");
         }
     }
 
