@@ -8,14 +8,14 @@ mod paint;
 
 use std::path::Path;
 
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 use cnerf_core::{
     camera::Camera,
     codes::{self, Aspect},
     data::{labels::LabelMap, picture},
     eval::locality::EditChange,
     model::generator::{Generator, Picture},
-    region::RegionSet,
+    region::{REGION_COUNT, Region, RegionSet},
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -28,7 +28,7 @@ pub use self::{
 use crate::{
     error::{Error, Result},
     inverter::{Opened, one_picture},
-    portrait::{EditRecord, Portrait, Undo},
+    portrait::{EditRecord, LARGEST_TINT, Portrait, Undo},
 };
 
 /// Where an edit's codes come from.
@@ -52,8 +52,8 @@ pub enum Source {
 /// A [`Source`] that is at hand.
 #[derive(Clone, Debug)]
 pub enum Goal {
-    /// Codes `[1, 9, 2, D]`.
-    Codes(Tensor),
+    /// Codes `[1, 9, 2, D]`, and the tint `[9, 3]` that goes with their textures, if any.
+    Codes(Tensor, Option<Tensor>),
     /// A region map of the portrait's own view, repainted.
     Painted(LabelMap),
     /// The regions' mean colour is to be this.
@@ -109,11 +109,11 @@ impl Goal {
     pub fn of(source: &Source, model: &Generator, other: Option<&Portrait>, map: Option<LabelMap>) -> Result<Self> {
         let unread = |name: &str| Error::config("edit", format!("{name} was not read"));
         Ok(match source {
-            Source::Seed(seed) => Self::Codes(model.codes_from_seed(*seed, 1.0)?),
-            Source::Mean => Self::Codes(model.mean_codes()?),
+            Source::Seed(seed) => Self::Codes(model.codes_from_seed(*seed, 1.0)?, None),
+            Source::Mean => Self::Codes(model.mean_codes()?, None),
             Source::Portrait(name) => {
                 let portrait = other.ok_or_else(|| unread(name))?;
-                Self::Codes(portrait.codes.unsqueeze(0)?.to_device(&model.device())?)
+                Self::Codes(portrait.codes.unsqueeze(0)?.to_device(&model.device())?, portrait.tint.clone())
             }
             Source::Painted(name) => Self::Painted(map.ok_or_else(|| unread(name))?),
             Source::Colour(colour) => Self::Colour(*colour),
@@ -121,12 +121,17 @@ impl Goal {
         })
     }
 
-    /// The codes `[1, 9, 2, D]` an edit of `opened` goes towards, and the regions it is about: those named, or those a
-    /// map changes where none is named.
-    fn resolve(&self, opened: &Opened, camera: &Camera, edit: &Edit) -> Result<(Tensor, RegionSet)> {
+    /// What an edit of `opened`, whose tint is `tint`, goes towards.
+    fn resolve(&self, opened: &Opened, tint: &Tensor, camera: &Camera, edit: &Edit) -> Result<Destination> {
         let regions = edit.regions;
-        Ok(match self {
-            Self::Codes(codes) => (codes.clone(), regions),
+        let (codes, regions) = match self {
+            Self::Codes(codes, other) => {
+                let tint = match other {
+                    Some(other) => other.to_device(tint.device())?,
+                    None => tint.zeros_like()?,
+                };
+                return Ok(Destination { codes: codes.clone(), tint, regions });
+            }
             Self::Direction(number) => {
                 let rows = directions(&opened.generator, regions, edit.aspect, *number)?;
                 let style_dim = rows.dim(1)?;
@@ -144,14 +149,34 @@ impl Goal {
                 (paint::codes(opened, camera, &map, regions)?, regions)
             }
             Self::Colour(colour) => {
-                let mut found = opened.clone();
+                let (mut found, mut tint) = (opened.clone(), tint.clone());
                 for region in regions.iter() {
                     found.codes = colour::codes(&found, camera, region, *colour)?;
+                    tint = colour::tint(&found, &tint, camera, region, *colour)?;
                 }
-                (found.codes, regions)
+                return Ok(Destination { codes: found.codes, tint, regions });
             }
-        })
+        };
+        Ok(Destination { codes, tint: tint.clone(), regions })
     }
+}
+
+/// What an edit goes towards.
+struct Destination {
+    /// `[1, 9, 2, D]`.
+    codes: Tensor,
+    /// `[9, 3]`.
+    tint: Tensor,
+    /// The regions it is about: those named, or those a map changes where none is named.
+    regions: RegionSet,
+}
+
+/// `own` `[9, 3]` moved towards `other` in the regions whose textures an edit changes.
+fn blended_tint(own: &Tensor, other: &Tensor, edit: &Edit) -> Result<Tensor> {
+    let rows = Region::ALL.map(|region| f32::from(u8::from(edit.aspect.covers(1) && edit.regions.contains(region))));
+    let rows = Tensor::new(&rows, own.device())?.unsqueeze(1)?;
+    let moved = ((other - own)? * edit.amount)?.broadcast_mul(&rows)?;
+    Ok((own + moved)?.clamp(-LARGEST_TINT, LARGEST_TINT)?)
 }
 
 /// Applies edits in order, each with what it goes towards, and measures what they changed together. The portrait, read
@@ -167,11 +192,23 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
     let mut history = Vec::with_capacity(edits.len());
     let mut all = RegionSet::EMPTY;
     let mut colour_difference = None;
+    let mut kept_tint = portrait.tint.clone();
     for (edit, goal) in edits {
-        let (source, regions) = goal.resolve(&opened, &camera, edit)?;
+        let tint = match &kept_tint {
+            Some(tint) => tint.to_device(&model.device())?,
+            None => Tensor::zeros((REGION_COUNT, 3), DType::F32, &model.device())?,
+        };
+        let Destination { codes: source, tint: other, regions } = goal.resolve(&opened, &tint, &camera, edit)?;
         let edit = Edit { regions, ..edit.clone() };
-        let undo = Undo { codes: opened.codes.squeeze(0)?, upsampler_code: portrait.upsampler_code.clone() };
+        let undo = Undo {
+            codes: opened.codes.squeeze(0)?,
+            upsampler_code: portrait.upsampler_code.clone(),
+            tint: kept_tint.take(),
+        };
         opened.codes = codes::blend(&opened.codes, &source, edit.regions, edit.aspect, edit.amount)?.detach();
+        let tint = blended_tint(&tint, &other, &edit)?;
+        opened.set_tint(&tint)?;
+        kept_tint = (tint.abs()?.sum_all()?.to_scalar::<f32>()? > 0.0).then_some(tint);
         let after = opened.picture(&camera)?;
         let change = measure(&before, &after, edit.regions)?;
         if let Goal::Colour(colour) = goal {
@@ -184,6 +221,7 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
     let edited = Edited { colour_difference, ..compare(&first, &before, all)? };
     portrait.thumbnail = thumbnail(portrait, &edited.after)?;
     portrait.codes = opened.codes.squeeze(0)?;
+    portrait.tint = kept_tint;
     portrait.history.extend(history);
     Ok(edited)
 }

@@ -12,7 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use candle_core::Device;
+use candle_core::{Device, Tensor};
 use cnerf_core::{
     camera::Camera,
     data::{
@@ -358,6 +358,7 @@ fn portrait() -> (Vec<u8>, Generator) {
         crop: Some(CropTransform { centre_x: 1.5, centre_y: 2.0, half_side: 3.0, angle_rad: 0.1 }),
         codes: generator.codes_from_seed(4, 1.0).unwrap().squeeze(0).unwrap(),
         upsampler_code: None,
+        tint: Some(Tensor::full(0.1f32, (9, 3), &Device::Cpu).unwrap()),
         camera: Camera::at(0.1, 0.0),
         deltas: Deltas::between(&original, &tuned).unwrap(),
         noise: Vec::new(),

@@ -1,6 +1,10 @@
 //! The inverter: one optimiser step a call, from a subject to its portrait.
 
-use std::{collections::VecDeque, path::Path, time::Instant};
+use std::{
+    collections::{BTreeMap, VecDeque},
+    path::Path,
+    time::Instant,
+};
 
 use candle_core::{DType, Device, Tensor};
 use cnerf_core::{
@@ -35,6 +39,9 @@ const THUMBNAIL: u32 = 96;
 const NOVEL_VIEW_RAD: f64 = 0.4;
 /// Depth along the view axis shown as white and as black, world units.
 const DEPTH_SHOWN: [f64; 2] = [0.92, 1.08];
+
+/// The weight that moves a region's colour and nothing else.
+const COLOUR_BIAS: &str = "field.colour.bias";
 
 /// An inversion under way.
 pub struct Inverter<'a> {
@@ -283,6 +290,7 @@ impl<'a> Inverter<'a> {
             crop: Some(subject.aligned.transform),
             codes: codes.squeeze(0)?,
             upsampler_code: global.as_ref().map(|code| code.squeeze(0)).transpose()?,
+            tint: None,
             camera,
             deltas: deltas.clone(),
             noise: Vec::new(),
@@ -339,6 +347,8 @@ pub struct Opened {
     pub global: Option<Tensor>,
     /// The camera that saw the photo.
     pub camera: Camera,
+    /// The bias of every region's colour head before a tint is added, `[9, 3]`.
+    pub(crate) untinted: Tensor,
 }
 
 impl Opened {
@@ -349,7 +359,21 @@ impl Opened {
         let codes = portrait.codes.unsqueeze(0)?.to_device(&device)?;
         model.field().film(&codes)?; // Refuses codes of another length before anything is rendered.
         let global = portrait.upsampler_code.as_ref().map(|code| code.unsqueeze(0)?.to_device(&device)).transpose()?;
-        Ok(Self { generator: portrait.deltas.generator(model)?, codes, global, camera: portrait.camera })
+        let generator = portrait.deltas.generator(model)?;
+        let biases = generator.parameters().snapshot()?.remove(COLOUR_BIAS);
+        let untinted = biases.ok_or_else(|| cnerf_core::Error::shape(COLOUR_BIAS, "[9, 3]", &[]))?;
+        let opened = Self { generator, codes, global, camera: portrait.camera, untinted };
+        if let Some(tint) = &portrait.tint {
+            opened.set_tint(tint)?;
+        }
+        Ok(opened)
+    }
+
+    /// Adds `tint` `[9, 3]` to the regions' colours, in place of the tint they have. Clones share their generator.
+    pub(crate) fn set_tint(&self, tint: &Tensor) -> Result<()> {
+        let tint = tint.to_device(self.untinted.device())?.to_dtype(self.untinted.dtype())?;
+        let tinted = BTreeMap::from([(COLOUR_BIAS.to_owned(), (&self.untinted + tint)?)]);
+        Ok(self.generator.parameters().restore(&tinted)?)
     }
 
     /// The portrait's finished picture from `camera`.

@@ -6,8 +6,9 @@
 //! | `upsampler_code` | f32 `[L]` | the global code, for upsamplers that have one |
 //! | `delta.NAME` | f16, the weight's shape | what tuning added to the model's weight NAME, divided by its scale |
 //! | `noise.N` | f32 | noise images of an upsampler that has them |
+//! | `tint` | f32 `[9, 3]` | what edits added to the colour of every region, if they did |
 //! | `thumbnail` | u8 `[bytes]` | a PNG |
-//! | `undo.N.codes`, `undo.N.upsampler_code` | f32 | codes before edit N |
+//! | `undo.N.codes`, `undo.N.upsampler_code`, `undo.N.tint` | f32 | what edit N changed, as it was before |
 //!
 //! All else is the JSON header in `__metadata__`. The model is named by its hash: weights are stored as differences
 //! to it, so that a file stays well under 2 MB.
@@ -45,6 +46,8 @@ const VERSION: u32 = 1;
 const LARGEST_FILE: u64 = 512 << 20;
 /// Longest code row.
 const LARGEST_STYLE_DIM: usize = 4096;
+/// Largest part of a tint, colours in [-1, 1].
+pub(crate) const LARGEST_TINT: f32 = 2.0;
 /// Width and height of a thumbnail that is read, pixels.
 const LARGEST_THUMBNAIL: u32 = 1024;
 
@@ -100,6 +103,8 @@ pub struct Undo {
     pub codes: Tensor,
     /// `[L]`.
     pub upsampler_code: Option<Tensor>,
+    /// `[9, 3]`.
+    pub tint: Option<Tensor>,
 }
 
 /// A portrait: a photo brought into a model's space.
@@ -115,6 +120,8 @@ pub struct Portrait {
     pub codes: Tensor,
     /// The upsampler's global code `[L]`, f32, if it has one.
     pub upsampler_code: Option<Tensor>,
+    /// What edits add to the colour of every region's field, `[9, 3]`, f32, colours in [-1, 1].
+    pub tint: Option<Tensor>,
     /// The camera that saw the photo.
     pub camera: Camera,
     /// Tuned weights as differences.
@@ -153,6 +160,9 @@ impl Portrait {
         if let Some(code) = &self.upsampler_code {
             tensors.insert("upsampler_code".into(), code.to_dtype(DType::F32)?.contiguous()?);
         }
+        if let Some(tint) = &self.tint {
+            tensors.insert("tint".into(), tint.to_dtype(DType::F32)?.contiguous()?);
+        }
         for (index, noise) in self.noise.iter().enumerate() {
             tensors.insert(format!("noise.{index}"), noise.to_dtype(DType::F32)?.contiguous()?);
         }
@@ -160,6 +170,9 @@ impl Portrait {
             tensors.insert(format!("undo.{index}.codes"), undo.codes.to_dtype(DType::F32)?.contiguous()?);
             if let Some(code) = &undo.upsampler_code {
                 tensors.insert(format!("undo.{index}.upsampler_code"), code.to_dtype(DType::F32)?.contiguous()?);
+            }
+            if let Some(tint) = &undo.tint {
+                tensors.insert(format!("undo.{index}.tint"), tint.to_dtype(DType::F32)?.contiguous()?);
             }
         }
         let mut png = Cursor::new(Vec::new());
@@ -203,12 +216,14 @@ impl Portrait {
         let mut reader = Reader { path, tensors: &mut tensors };
         let codes = reader.codes("codes", None)?;
         let upsampler_code = reader.optional_row("upsampler_code")?;
+        let tint = reader.tint("tint")?;
         let thumbnail = reader.thumbnail()?;
         let mut history = Vec::with_capacity(header.history.len().min(1 << 16));
         for (index, record) in header.history.into_iter().enumerate() {
             let codes = reader.codes(&format!("undo.{index}.codes"), Some(codes.dims()))?;
             let upsampler_code = reader.optional_row(&format!("undo.{index}.upsampler_code"))?;
-            history.push((record, Undo { codes, upsampler_code }));
+            let tint = reader.tint(&format!("undo.{index}.tint"))?;
+            history.push((record, Undo { codes, upsampler_code, tint }));
         }
         let noise = reader.noise()?;
         let deltas = Deltas::from_stored(path, reader.tensors, &header.delta_scales)?;
@@ -221,6 +236,7 @@ impl Portrait {
             crop: header.crop,
             codes,
             upsampler_code,
+            tint,
             camera: header.camera,
             deltas,
             noise,
@@ -249,6 +265,7 @@ impl Portrait {
         let (record, before) = self.history.pop().ok_or_else(|| Error::NothingToUndo { path: PathBuf::from(path) })?;
         self.codes = before.codes;
         self.upsampler_code = before.upsampler_code;
+        self.tint = before.tint;
         Ok(record)
     }
 }
@@ -306,6 +323,15 @@ impl Reader<'_> {
             }
             row => Ok(row),
         }
+    }
+
+    fn tint(&mut self, name: &str) -> Result<Option<Tensor>> {
+        let Some(tint) = self.take(name, DType::F32)? else { return Ok(None) };
+        let bounded = tint.flatten_all()?.to_vec1::<f32>()?.iter().all(|value| value.abs() <= LARGEST_TINT);
+        if tint.dims() != [REGION_COUNT, 3] || !bounded {
+            return self.refuse(format!("tensor `{name}` has shape {:?} or values no colour has", tint.dims()));
+        }
+        Ok(Some(tint))
     }
 
     fn noise(&mut self) -> Result<Vec<Tensor>> {

@@ -141,7 +141,7 @@ impl Portraits {
                 Ok((format!("seed {seed}"), measure(&subject, &donor)?))
             }
             (None, Some(path)) => {
-                let Opened { generator, codes, global, camera } = portraits::open(path, &self.model)?;
+                let Opened { generator, codes, global, camera, .. } = portraits::open(path, &self.model)?;
                 let donor = generator.codes_from_seed(donor, self.truncation)?.detach();
                 let subject = Subject { generator: &generator, codes, global, camera };
                 Ok((path.display().to_string(), measure(&subject, &donor)?))

@@ -1,8 +1,10 @@
 //! A region in a colour of one's own: its texture code is moved until the region's mean colour is the one asked for.
 //!
-//! In two parts. Descent on rays of the field, which is cheap, takes the code near: the region recoloured with its own
-//! light and shade. Then Newton's steps on the finished picture, upsampler included, each the shortest move of the code
-//! that closes what the mean colour still misses: they hit the colour and leave the shading alone.
+//! In three parts. Descent on rays of the field, which is cheap, takes the code near: the region recoloured with its
+//! own light and shade. Then Newton's steps on the finished picture, upsampler included, each the shortest move of the
+//! code that closes what the mean colour still misses. Codes show the colours that the model has seen on people; what
+//! is left to another one is a tint, a constant added to the region's colour head: it moves no other region and no
+//! surface, and leaves light and shade as they are.
 
 use std::str::FromStr;
 
@@ -20,6 +22,7 @@ use crate::{
     inverter::Opened,
     objective,
     pivot::whole_picture,
+    portrait::LARGEST_TINT,
     space::CodeSpace,
 };
 
@@ -37,13 +40,15 @@ const HOLD: f64 = 1e-3;
 /// Luma, in [0, 1], that is added before light and shade are measured as shares of the mean: what is nearly black has
 /// no shading worth stretching.
 const SHADE_FLOOR: f64 = 0.1;
-/// Most of Newton's steps, failed ones included.
-const NEWTON_STEPS: usize = 10;
-/// Longest of them, root mean square of the code's whitened coordinates: farther away the picture is no longer linear.
-const NEWTON_REACH: f64 = 0.35;
-/// Share of the mean squared gradient that is added to a Newton step's diagonal: a colour the code hardly moves is
-/// not chased.
-const NEWTON_DAMPING: f64 = 1e-3;
+/// Most pictures that Newton's steps may take.
+const NEWTON_PICTURES: usize = 10;
+/// Longest first step, root mean square of the code's whitened coordinates. Hue hangs on the code far more weakly than
+/// lightness: steps that mend it are long, and curved in lightness.
+const NEWTON_REACH: f64 = 0.1;
+/// What becomes of the reach after a step that came nearer, and after one that did not.
+const REACH_FACTORS: [f64; 2] = [1.5, 0.4];
+/// Most pictures that the tint may take.
+const TINT_PICTURES: usize = 8;
 /// A perceived difference that is not worth another step.
 const CLOSE_ENOUGH: f64 = 0.5;
 /// ITU-R BT.601.
@@ -126,6 +131,33 @@ pub fn codes(opened: &Opened, camera: &Camera, region: Region, colour: Colour) -
     search.codes()
 }
 
+/// The tint `[9, 3]`, `tint` but for the row of `region`, with which `opened` shows it in `colour` from `camera`. The
+/// mean colour follows a tint one to one but for pixels that are black or white: what is missed is added until it is
+/// not. The generator of `opened` keeps the last tint tried.
+pub fn tint(opened: &Opened, tint: &Tensor, camera: &Camera, region: Region, colour: Colour) -> Result<Tensor> {
+    let wanted = colour.0.map(|value| f64::from(value) / 127.5 - 1.0);
+    let mut rows: Vec<Vec<f32>> = tint.to_vec2()?;
+    let mut nearest: Option<(f64, Tensor)> = None;
+    for _ in 0..TINT_PICTURES {
+        let tried = Tensor::new(rows.clone(), tint.device())?;
+        opened.set_tint(&tried)?;
+        let Some(mean) = mean_colour(opened, camera, region)? else { break };
+        let difference = perceived_difference(mean, wanted)?;
+        if nearest.as_ref().is_none_or(|(least, _)| difference < *least) {
+            nearest = Some((difference, tried));
+        }
+        if difference < CLOSE_ENOUGH {
+            break;
+        }
+        for (value, (wanted, mean)) in
+            rows.iter_mut().skip(region.index()).take(1).flatten().zip(wanted.iter().zip(mean))
+        {
+            *value = (*value + (wanted - mean) as f32).clamp(-LARGEST_TINT, LARGEST_TINT);
+        }
+    }
+    Ok(nearest.map_or_else(|| tint.clone(), |(_, tint)| tint))
+}
+
 /// Takes the code near on rays of the field. What the upsampler adds to the mean is taken to stay what it was:
 /// `finished` is the mean of the whole `picture`.
 fn descend(
@@ -174,54 +206,71 @@ fn descend(
 /// Closes what the finished picture's mean colour still misses, and ends at the nearest it found.
 fn newton(search: &mut Displacement, opened: &Opened, camera: &Camera, region: Region, wanted: [f64; 3]) -> Result<()> {
     let view = Camera::parameter_tensor(&[*camera], &opened.generator.device())?;
-    let mut nearest: Option<(f64, Tensor)> = None;
-    let mut step = search.rows()?.zeros_like()?;
-    for _ in 0..=NEWTON_STEPS {
+    let mut reach = NEWTON_REACH;
+    let mut nearest: Option<Nearest> = None;
+    for _ in 0..NEWTON_PICTURES {
         let picture = whole_picture(&opened.generator, &search.live()?, opened.global.as_ref(), &view, true)?;
         let Some(inside) = Inside::of(&picture, region)? else { break };
         let mean = inside.mean(&picture.rgb)?;
         let difference = perceived_difference(mean, wanted)?;
-        match &nearest {
-            // Too far: half as far, from where it was nearest.
-            Some((least, rows)) if difference >= *least => {
-                search.set(rows)?;
-                step = (step * 0.5)?;
-            }
-            _ => {
-                nearest = Some((difference, search.rows()?));
-                if difference < CLOSE_ENOUGH {
-                    break;
-                }
-                let missed: [f64; 3] = std::array::from_fn(|channel| wanted[channel] - mean[channel]);
-                step = shortest(&inside.gradients(&picture.rgb, search)?, missed)?;
-            }
+        if nearest.as_ref().is_none_or(|nearest| difference < nearest.difference) {
+            let came_nearer = nearest.is_some();
+            let missed = std::array::from_fn(|channel| wanted[channel] - mean[channel]);
+            let gradients = inside.gradients(&picture.rgb, search)?;
+            nearest = Some(Nearest { difference, rows: search.rows()?, missed, gradients });
+            reach *= if came_nearer { REACH_FACTORS[0] } else { 1.0 };
+        } else {
+            reach *= REACH_FACTORS[1];
         }
-        search.shift(&step)?;
+        let Some(nearest) = nearest.as_ref().filter(|nearest| nearest.difference > CLOSE_ENOUGH) else { break };
+        search.set(&nearest.rows)?;
+        search.shift(&shortest(&nearest.gradients, nearest.missed, reach)?)?;
     }
-    if let Some((_, rows)) = nearest {
-        search.set(&rows)?;
+    if let Some(nearest) = nearest {
+        search.set(&nearest.rows)?;
     }
     Ok(())
 }
 
-/// The shortest step Δ with J Δ = `missed`, damped and no longer than [`NEWTON_REACH`]. `gradients` are the rows of J,
-/// each as the code's rows are.
-fn shortest(gradients: &[Tensor; 3], missed: [f64; 3]) -> Result<Tensor> {
+/// Where the picture came nearest to the colour.
+struct Nearest {
+    difference: f64,
+    rows: Tensor,
+    /// What the mean misses, [-1, 1] units.
+    missed: [f64; 3],
+    /// Of the mean's channels to the rows.
+    gradients: [Tensor; 3],
+}
+
+/// The step Δ no longer than `reach` (root mean square) that leaves least of `missed` - J Δ: Levenberg's, with as much
+/// damping as the reach takes. `gradients` are the rows of J, each as the code's rows are.
+fn shortest(gradients: &[Tensor; 3], missed: [f64; 3], reach: f64) -> Result<Tensor> {
     let mut gram = [[0.0; 3]; 3];
     for (row, a) in gradients.iter().enumerate() {
         for (column, b) in gradients.iter().enumerate() {
             gram[row][column] = objective::scalar(&(a * b)?.sum_all()?)?;
         }
     }
-    let damping = NEWTON_DAMPING * (0..3).map(|index| gram[index][index]).sum::<f64>() / 3.0 + 1e-12;
-    (0..3).for_each(|index| gram[index][index] += damping);
-    let shares = solve(gram, missed);
+    let count = gradients[0].elem_count().max(1) as f64;
+    let size = (0..3).map(|index| gram[index][index]).sum::<f64>() / 3.0;
+    let mut damping = 1e-6 * size + 1e-12;
+    let shares = loop {
+        let mut damped = gram;
+        (0..3).for_each(|index| damped[index][index] += damping);
+        let shares = solve(damped, missed);
+        let square =
+            (0..3).map(|row| (0..3).map(|column| shares[row] * gram[row][column] * shares[column]).sum::<f64>());
+        // Damping far beyond the gradients' size only shortens the step further: the loop ends.
+        if (square.sum::<f64>() / count).sqrt() <= reach || damping > 1e6 * size + 1.0 {
+            break shares;
+        }
+        damping *= 2.0;
+    };
     let mut step = gradients[0].zeros_like()?;
     for (gradient, share) in gradients.iter().zip(shares) {
         step = (step + (gradient * share)?)?;
     }
-    let length = objective::scalar(&step.sqr()?.mean_all()?)?.sqrt();
-    Ok(if length > NEWTON_REACH { (step * (NEWTON_REACH / length))? } else { step })
+    Ok(step)
 }
 
 /// Solves a symmetric positive definite system by Cramer's rule.
@@ -334,15 +383,16 @@ mod tests {
         let mut random = Stream::new(3, &[]);
         let gradients: [Tensor; 3] = std::array::from_fn(|_| random.normal_tensor(&[1, 16], &device).unwrap());
         let missed = [0.03, -0.02, 0.01];
-        let step = shortest(&gradients, missed).unwrap();
+        let step = shortest(&gradients, missed, 1.0).unwrap();
         for (gradient, missed) in gradients.iter().zip(missed) {
             let closed = objective::scalar(&(gradient * &step).unwrap().sum_all().unwrap()).unwrap();
-            // The damping leaves about a thousandth.
-            assert!((closed - missed).abs() < 2e-4, "{closed} {missed}");
+            // The damping leaves about a millionth; the rest is f32.
+            assert!((closed - missed).abs() < 1e-6, "{closed} {missed}");
         }
-        let short = shortest(&gradients, missed.map(|value| 1e3 * value)).unwrap();
+        let short = shortest(&gradients, missed.map(|value| 1e3 * value), 0.1).unwrap();
         let length = objective::scalar(&short.sqr().unwrap().mean_all().unwrap()).unwrap().sqrt();
-        assert!((length - NEWTON_REACH).abs() < 1e-5, "{length}");
+        // Damping goes in doublings: never beyond the reach, never far from it.
+        assert!((0.04..0.1 + 1e-6).contains(&length), "{length}");
     }
 
     #[test]

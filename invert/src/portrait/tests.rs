@@ -14,13 +14,15 @@ fn sample() -> (Portrait, BTreeMap<String, Tensor>) {
         edit: Edit { regions: Region::Hair.into(), aspect: Aspect::Texture, source: Source::Seed(3), amount: 0.5 },
         change: Change { inside_change: 0.1, outside_change: 0.01, depth_change: 0.0 },
     };
-    let undo = Undo { codes: draw(&[9, 2, 6]), upsampler_code: None };
+    let undo =
+        Undo { codes: draw(&[9, 2, 6]), upsampler_code: None, tint: Some(draw(&[9, 3]).clamp(-1.0, 1.0).unwrap()) };
     let portrait = Portrait {
         model: ModelName { name: "portrait".into(), hash: "ab".repeat(32) },
         source: "photo.jpg".into(),
         crop: Some(CropTransform { centre_x: 1.5, centre_y: 2.0, half_side: 3.0, angle_rad: 0.1 }),
         codes,
         upsampler_code: Some(draw(&[6])),
+        tint: Some((draw(&[9, 3]) * 0.1).unwrap()),
         camera: Camera::at(0.2, -0.1),
         deltas: Deltas::between(&original, &tuned).unwrap(),
         noise: vec![draw(&[1, 1, 2, 2])],
@@ -51,6 +53,7 @@ fn portraits_round_trip() {
     let read = Portrait::load(&path).unwrap();
     assert_eq!(values(&read.codes), values(&portrait.codes));
     assert_eq!(values(read.upsampler_code.as_ref().unwrap()), values(portrait.upsampler_code.as_ref().unwrap()));
+    assert_eq!(values(read.tint.as_ref().unwrap()), values(portrait.tint.as_ref().unwrap()));
     assert_eq!((read.camera, read.crop, &read.thumbnail), (portrait.camera, portrait.crop, &portrait.thumbnail));
     assert_eq!((&read.config, &read.metrics, &read.model), (&portrait.config, &portrait.metrics, &portrait.model));
     assert_eq!(read.history[0].0, portrait.history[0].0);
@@ -110,6 +113,7 @@ fn faults_are_named_in_one_line() {
     refusal(&Portrait { codes: (tensor(&[9, 2, 6]) / 0.0).unwrap(), ..portrait.clone() }, "not finite");
     refusal(&Portrait { codes: tensor(&[9, 2, 5]), ..portrait.clone() }, "`undo.0.codes`");
     refusal(&Portrait { upsampler_code: Some(tensor(&[2, 3])), ..portrait.clone() }, "`upsampler_code`");
+    refusal(&Portrait { tint: Some(tensor(&[3, 9])), ..portrait.clone() }, "`tint`");
     refusal(&Portrait { noise: vec![tensor(&[3])], ..portrait.clone() }, "`noise.0`");
     refusal(&Portrait { camera: Camera::at(1e9, 0.0), ..portrait.clone() }, "camera");
 
