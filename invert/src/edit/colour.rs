@@ -131,13 +131,15 @@ pub fn codes(opened: &Opened, camera: &Camera, region: Region, colour: Colour) -
     search.codes()
 }
 
-/// The tint `[9, 3]`, `tint` but for the row of `region`, with which `opened` shows it in `colour` from `camera`. The
-/// mean colour follows a tint one to one but for pixels that are black or white: what is missed is added until it is
-/// not. The generator of `opened` keeps the last tint tried.
+/// The tint `[9, 3]`, `tint` but for the row of `region`, with which `opened` shows it in `colour` from `camera`: found
+/// by secants, channel by channel. The generator of `opened` keeps the last tint tried.
 pub fn tint(opened: &Opened, tint: &Tensor, camera: &Camera, region: Region, colour: Colour) -> Result<Tensor> {
     let wanted = colour.0.map(|value| f64::from(value) / 127.5 - 1.0);
     let mut rows: Vec<Vec<f32>> = tint.to_vec2()?;
     let mut nearest: Option<(f64, Tensor)> = None;
+    let mut before: Option<([f64; 3], [f64; 3])> = None;
+    // How much of a tint the mean colour shows: all of it, but for pixels shared with other regions or out of range.
+    let mut shares = [1.0; 3];
     for _ in 0..TINT_PICTURES {
         let tried = Tensor::new(rows.clone(), tint.device())?;
         opened.set_tint(&tried)?;
@@ -146,14 +148,21 @@ pub fn tint(opened: &Opened, tint: &Tensor, camera: &Camera, region: Region, col
         if nearest.as_ref().is_none_or(|(least, _)| difference < *least) {
             nearest = Some((difference, tried));
         }
-        if difference < CLOSE_ENOUGH {
-            break;
+        let Some(row) = rows.get_mut(region.index()).filter(|_| difference > CLOSE_ENOUGH) else { break };
+        let own: [f64; 3] = std::array::from_fn(|channel| row.get(channel).copied().map_or(0.0, f64::from));
+        if let Some((own_before, mean_before)) = before {
+            for channel in 0..3 {
+                let moved = own[channel] - own_before[channel];
+                if moved.abs() > 1e-3 {
+                    shares[channel] = ((mean[channel] - mean_before[channel]) / moved).clamp(0.2, 2.0);
+                }
+            }
         }
-        for (value, (wanted, mean)) in
-            rows.iter_mut().skip(region.index()).take(1).flatten().zip(wanted.iter().zip(mean))
-        {
-            *value = (*value + (wanted - mean) as f32).clamp(-LARGEST_TINT, LARGEST_TINT);
+        for (channel, value) in row.iter_mut().enumerate().take(3) {
+            let next = own[channel] + (wanted[channel] - mean[channel]) / shares[channel];
+            *value = (next as f32).clamp(-LARGEST_TINT, LARGEST_TINT);
         }
+        before = Some((own, mean));
     }
     Ok(nearest.map_or_else(|| tint.clone(), |(_, tint)| tint))
 }
