@@ -174,7 +174,8 @@ pub fn roofline(speeds: &[Speed], machine: &Machine) -> Result<String> {
             }
         }
     }
-    let most = speeds.iter().map(|speed| speed.operations_per_byte).fold(1.0, f64::max) * 4.0;
+    // Ceilings go on far beyond the dots: there the legend finds room.
+    let most = speeds.iter().map(|speed| speed.operations_per_byte).fold(1.0, f64::max) * 1000.0;
     for peak in machine.peaks.iter().filter(|peak| speeds.iter().any(|speed| speed.path == peak.name)) {
         let knee = peak.gflops / machine.memory_gigabytes_per_second;
         let points = vec![(0.25, 0.25 * machine.memory_gigabytes_per_second), (knee, peak.gflops), (most, peak.gflops)];

@@ -326,7 +326,8 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
             .collect(),
         mark: Mark::LineAndDots,
     };
-    let ends = (SAMPLES[0] as f64, SAMPLES[SAMPLES.len() - 1] as f64);
+    let all = report.discretisation.iter().map(|sum| sum.samples);
+    let ends = (all.clone().fold(f64::INFINITY, f64::min), all.fold(1.0, f64::max));
     let discretisation = LineChart {
         title: "Samples against the converged integral (1024 samples)".into(),
         subtitle,

@@ -77,7 +77,12 @@ impl Axis {
     }
 
     fn label(&self, place: f64) -> String {
-        number(if self.logarithmic { 10f64.powf(place) } else { place })
+        if !self.logarithmic {
+            return number(place);
+        }
+        // Even steps of less than a decade are at no round values.
+        let unit = 10f64.powf(place.floor() - 1.0);
+        number((10f64.powf(place) / unit).round() * unit)
     }
 
     /// Ends and ticks of an axis that shows all `places`.
