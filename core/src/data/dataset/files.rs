@@ -48,10 +48,13 @@ impl Files {
         let mut seen = HashSet::new();
         for name in archive.file_names() {
             let name = name.map_err(|error| Error::malformed(path, error))?;
-            check_name(name.strip_suffix('/').unwrap_or(&name))
-                .map_err(|fault| Error::malformed(path, format!("entry `{name}` {fault}; pack the archive again")))?;
+            // Escaped: a name may hold a line break, a message may not.
+            let refuse = |fault: &str| {
+                Error::malformed(path, format!("entry `{}` {fault}; pack the archive again", name.escape_debug()))
+            };
+            check_name(name.strip_suffix('/').unwrap_or(&name)).map_err(refuse)?;
             if !seen.insert(name.to_lowercase()) {
-                return Err(Error::malformed(path, format!("entry `{name}` is there twice; pack the archive again")));
+                return Err(refuse("is there twice"));
             }
         }
         Ok(Self::Zip { path: path.to_owned(), archive: Box::new(archive) })
@@ -74,8 +77,9 @@ impl Files {
 
     /// Reads a whole file of at most `limit` bytes.
     pub(super) fn read(&self, name: &str, limit: u64) -> Result<Vec<u8>> {
-        let shown = self.path_of(name);
+        let shown = self.path_of(&name.escape_debug().to_string());
         check_name(name).map_err(|fault| Error::malformed(&shown, format!("the name {fault}")))?;
+        let shown = self.path_of(name);
         let archive = match self {
             Self::Folder(_) => return picture::read_file(&shown, limit),
             Self::Zip { archive, .. } => archive,
@@ -106,8 +110,8 @@ pub(super) fn check_name(name: &str) -> Result<(), &'static str> {
     let drive = name.as_bytes().get(1) == Some(&b':');
     if name.starts_with('/') || drive {
         Err("is absolute")
-    } else if name.contains(['\\', '\0']) {
-        Err("has a backslash or a zero byte")
+    } else if name.contains(|character: char| character == '\\' || character.is_control()) {
+        Err("has a backslash or a control character")
     } else if name.split('/').any(|part| matches!(part, "" | "." | "..")) {
         Err("has an empty, `.` or `..` part")
     } else {
