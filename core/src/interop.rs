@@ -9,4 +9,5 @@ pub mod mesh;
 pub mod page;
 pub mod sheet;
 pub mod surface;
+pub mod tensorboard;
 pub mod torch;

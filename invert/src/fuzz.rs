@@ -65,14 +65,16 @@ enum Packing {
     Png,
 }
 
+/// Reads bytes, as a file of the path given if it needs one.
+type Read = Box<dyn Fn(&[u8], &Path) -> Result<()> + Send>;
+
 /// A kind of file, and how it is read.
 struct Reader {
     name: &'static str,
     seeds: Vec<(Vec<u8>, Packing)>,
     /// Resident memory that reading one file may add.
     most_memory: u64,
-    /// Reads the bytes, as a file of the path given if it needs one.
-    read: Box<dyn Fn(&[u8], &Path) -> Result<()> + Send>,
+    read: Read,
 }
 
 /// What became of a file.

@@ -128,6 +128,31 @@ fn a_killed_training_run_resumes_to_the_same_model() {
     assert!(folder.read("halves/model.safetensors") == folder.read("whole/model.safetensors"), "the models differ");
 }
 
+#[cfg(unix)]
+#[test]
+fn ctrl_c_ends_training_with_a_checkpoint_and_the_line_that_goes_on() {
+    let folder = Folder::with_model("ctrl_c");
+    let settings = "--preset tiny --stage warmup --seed 2 --set warmup.steps=120 --set log_steps=1 --quiet";
+    folder.run(&format!("train --data {DATA} --out whole {settings}")).done();
+    let mut command = folder.command(&format!("train --data {DATA} --out stopped {settings}"));
+    let training = command.stdout(std::process::Stdio::piped()).spawn().unwrap();
+    let (began, log) = (Instant::now(), folder.path("stopped/log.jsonl"));
+    while !log.exists() {
+        assert!(began.elapsed() < Duration::from_secs(120), "no step was logged");
+        thread::sleep(Duration::from_millis(5));
+    }
+    let interrupted = std::process::Command::new("kill").args(["-INT", &training.id().to_string()]).status().unwrap();
+    assert!(interrupted.success());
+    let ended = training.wait_with_output().unwrap();
+    assert_eq!(ended.status.code(), Some(1));
+    let said = String::from_utf8(ended.stdout).unwrap();
+    let (_, line) = said.trim().split_once("continue with: cnerf ").expect("a line that goes on");
+    assert!(!folder.path("stopped/model.safetensors").exists(), "the run ended before it could be stopped");
+    assert!(folder.list("stopped").iter().any(|name| name.starts_with("events.out.tfevents.")), "no TensorBoard file");
+    folder.run(line).done();
+    assert!(folder.read("stopped/model.safetensors") == folder.read("whole/model.safetensors"), "the models differ");
+}
+
 #[test]
 fn inverting_a_synthetic_portrait_writes_a_portrait_file_that_resembles_it() {
     let folder = Folder::with_model("invert");

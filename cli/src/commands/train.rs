@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, bail};
-use clap::Args;
+use clap::{Args, ValueEnum as _};
 use cnerf_core::{
     data::dataset::Dataset,
     eval::perceptual::Perceptual,
@@ -137,6 +137,19 @@ impl TrainArguments {
         Ok(config.with(&self.set)?)
     }
 
+    /// The line that continues this run.
+    fn resume_command(&self) -> String {
+        let mut words = vec!["cnerf train --resume --data".to_owned(), self.data.display().to_string()];
+        words.extend(["--out".to_owned(), self.out.display().to_string()]);
+        if let Some(stage) = self.stage.to_possible_value() {
+            words.extend(["--stage".to_owned(), stage.get_name().to_owned()]);
+        }
+        let model = self.model.model.as_ref().map(|model| ("--model", model.clone()));
+        let lpips = self.lpips.as_ref().map(|lpips| ("--lpips", lpips.display().to_string()));
+        words.extend([model, lpips].into_iter().flatten().flat_map(|(option, value)| [option.to_owned(), value]));
+        words.join(" ")
+    }
+
     fn dry_run(&self, config: &TrainConfig, portraits: usize, console: &Console) -> anyhow::Result<Outcome> {
         let parameters = Parameters::fresh(config.seed, candle_core::DType::F32, &candle_core::Device::Cpu);
         Generator::new(&config.model, &parameters)?;
@@ -193,7 +206,7 @@ impl TrainArguments {
                 .map_or(serde_json::Value::Null, |report| serde_json::to_value(report.metrics).unwrap_or_default()),
             interrupted,
         };
-        let resume = format!("cnerf train --data {} --out {} --resume", self.data.display(), self.out.display());
+        let resume = self.resume_command();
         console.result(&report, || match &report.model {
             Some(path) if !report.interrupted => format!("{} after {:.0} s", path.display(), report.seconds),
             _ => format!("stopped after step {}; continue with: {resume}", report.steps),

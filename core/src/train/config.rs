@@ -195,6 +195,8 @@ pub struct UpsamplerStageConfig {
     pub schedule: Schedule,
     /// Adam's β. Recipe: 0.9, 0.99; paper: 0, 0.99.
     pub betas: [f64; 2],
+    /// Adam's β of the discriminator. Paper: 0, 0.99.
+    pub discriminator_betas: [f64; 2],
     /// Weight of L1 against the portrait the code belongs to (needs a warmed-up model's codes).
     pub pixels: f64,
     /// Weight of LPIPS against it (needs `--lpips`).
@@ -204,6 +206,17 @@ pub struct UpsamplerStageConfig {
     pub perceptual_zoom: f64,
     /// Weight of the non-saturating adversarial loss.
     pub adversarial: f64,
+    /// Side of the square the discriminator sees, pixels of the picture, a power of two. Paper: the whole picture. On
+    /// squares, a few hundred photos give it many times as much to learn from.
+    pub adversarial_crop: usize,
+    /// The discriminator sees regions by their outlines, without shares: where masks are rendered and not learnt, their
+    /// softness alone would tell it real from generated. Paper: off.
+    pub hard_masks: bool,
+    /// Random portraits from random cameras a step, judged by the discriminator only. Paper: its whole batch; with
+    /// pairs, beside them.
+    pub random_portraits: usize,
+    /// Steps the discriminator learns alone before its verdict counts. Paper: 0.
+    pub discriminator_ahead_steps: usize,
     /// Channels of the discriminator relative to the authors' tables.
     pub channel_multiplier: f64,
     /// As in the field's stage.
@@ -295,7 +308,14 @@ impl TrainConfig {
                 perceptual: 0.15,
                 perceptual_zoom: 2.0,
                 adversarial: 0.0,
+                adversarial_crop: 64,
+                hard_masks: true,
+                random_portraits: 2,
+                discriminator_ahead_steps: 200,
                 channel_multiplier: 0.125,
+                r1_image: 1.0,
+                r1_mask: 10.0,
+                path_length: 0.0,
                 average_half_life_images: 1_000.0,
                 ..Self::paper_upsampler_stage()
             },
@@ -349,10 +369,15 @@ impl TrainConfig {
             discriminator_learning_rate: 2e-3,
             schedule: Schedule { warmup_steps: 1, hold: 1.0, floor: 1.0 },
             betas: [0.0, 0.99],
+            discriminator_betas: [0.0, 0.99],
             pixels: 0.0,
             perceptual: 0.0,
             perceptual_zoom: 1.0,
             adversarial: 1.0,
+            adversarial_crop: 512,
+            hard_masks: false,
+            random_portraits: 16,
+            discriminator_ahead_steps: 0,
             channel_multiplier: 1.0,
             r1_image: 10.0,
             r1_mask: 1_000.0,

@@ -2,9 +2,13 @@
 
 use std::path::PathBuf;
 
+use candle_core::{DType, Tensor};
 use serde::Serialize;
 
-use crate::train::config::Stage;
+use crate::{
+    error::{Error, Result},
+    train::config::Stage,
+};
 
 /// Something that happened during a run.
 #[derive(Clone, Debug)]
@@ -45,6 +49,15 @@ pub struct StepReport {
     pub metrics: Metrics,
 }
 
+impl StepReport {
+    /// Everything measured, each under `stage/name`.
+    pub fn scalars(&self) -> Vec<(String, f64)> {
+        let stage = format!("{:?}", self.stage).to_lowercase();
+        let seconds = [("seconds", self.seconds)];
+        self.metrics.0.iter().chain(&seconds).map(|(name, value)| (format!("{stage}/{name}"), *value)).collect()
+    }
+}
+
 /// Named numbers of a step in the order they were taken.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Metrics(pub Vec<(&'static str, f64)>);
@@ -60,14 +73,28 @@ impl Metrics {
         self.0.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
     }
 
+    /// Adds the value of a loss.
+    pub fn push_loss(&mut self, name: &'static str, loss: &Tensor) -> Result<()> {
+        self.push(name, f64::from(loss.to_dtype(DType::F32)?.to_scalar::<f32>()?));
+        Ok(())
+    }
+
     /// The first number that is not finite.
     pub fn first_not_finite(&self) -> Option<&'static str> {
         self.0.iter().find(|(_, value)| !value.is_finite()).map(|(name, _)| *name)
     }
+
+    /// An error that names the first loss that is not finite.
+    pub fn check_finite(&self) -> Result<()> {
+        match self.first_not_finite() {
+            Some(quantity) => Err(Error::not_finite(format!("loss term {quantity}"))),
+            None => Ok(()),
+        }
+    }
 }
 
 impl Serialize for Metrics {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
         serializer.collect_map(self.0.iter().copied())
     }
 }

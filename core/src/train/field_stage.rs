@@ -213,7 +213,7 @@ impl FieldStage {
             Auxiliary::View { angles_rad: &fakes.angles_rad, weight: self.config.view },
             Some(penalty),
         )?;
-        metrics.push("global", scalar(&loss.logistic)?);
+        metrics.push_loss("global", &loss.logistic)?;
         let mut total = loss.total;
         if self.config.semantic > 0.0 {
             let regions = draw_regions(self.config.batch, &mut random);
@@ -225,10 +225,10 @@ impl FieldStage {
                 Auxiliary::Class { labels: &labels, weight: 1.0 },
                 Some(penalty),
             )?;
-            metrics.push("semantic", scalar(&loss.logistic)?);
+            metrics.push_loss("semantic", &loss.logistic)?;
             total = (total + loss.total)?;
         }
-        finite(metrics)?;
+        metrics.check_finite()?;
         Ok(total)
     }
 
@@ -251,13 +251,13 @@ impl FieldStage {
                 }
             }
         }
-        finite(metrics)?;
+        metrics.check_finite()?;
         Ok(gradients)
     }
 
     fn weighted_decoupling(&self, random: &mut Stream, metrics: &mut Metrics) -> Result<Tensor> {
         let decoupling = self.decoupling(random)?;
-        metrics.push("decoupling", scalar(&decoupling)?);
+        metrics.push_loss("decoupling", &decoupling)?;
         Ok((decoupling * self.config.decoupling)?)
     }
 
@@ -271,7 +271,7 @@ impl FieldStage {
         let mut total = through([&fakes.image, &fakes.masks], |[image, masks]| {
             let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
             let terms = generator_terms(&self.judges.global, Pictures { image, masks }, view)?;
-            metrics.push("generator", scalar(&terms.adversarial)?);
+            metrics.push_loss("generator", &terms.adversarial)?;
             Ok(terms.total)
         })?;
         if config.semantic > 0.0 {
@@ -281,7 +281,7 @@ impl FieldStage {
             let loss = through([&fakes.image, &masks], |[image, masks]| {
                 let class = Auxiliary::Class { labels: &labels, weight: 1.0 };
                 let terms = generator_terms(&self.judges.semantic, Pictures { image, masks }, class)?;
-                metrics.push("generator_semantic", scalar(&terms.adversarial)?);
+                metrics.push_loss("generator_semantic", &terms.adversarial)?;
                 Ok((terms.total * config.semantic)?)
             })?;
             total = (total + loss)?;
@@ -289,8 +289,8 @@ impl FieldStage {
         let gradient = fakes.output.evaluation.gradient.as_ref();
         let eikonal = losses::eikonal(gradient.ok_or_else(|| Error::config("gradient", "the field gave none"))?)?;
         let minimal_surface = losses::minimal_surface(&fakes.output.evaluation.distance, MINIMAL_SURFACE_SHARPNESS)?;
-        metrics.push("eikonal", scalar(&eikonal)?);
-        metrics.push("minimal_surface", scalar(&minimal_surface)?);
+        metrics.push_loss("eikonal", &eikonal)?;
+        metrics.push_loss("minimal_surface", &minimal_surface)?;
         Ok(((total + (eikonal * config.eikonal)?)? + (minimal_surface * config.minimal_surface)?)?)
     }
 
@@ -398,17 +398,6 @@ fn through<const N: usize>(
 
 fn draw_regions(count: usize, random: &mut Stream) -> Vec<Region> {
     (0..count).map(|_| Region::ALL[random.below(Region::ALL.len())]).collect()
-}
-
-fn scalar(loss: &Tensor) -> Result<f64> {
-    Ok(f64::from(loss.to_dtype(DType::F32)?.to_scalar::<f32>()?))
-}
-
-fn finite(metrics: &Metrics) -> Result<()> {
-    match metrics.first_not_finite() {
-        Some(quantity) => Err(Error::not_finite(format!("loss term {quantity}"))),
-        None => Ok(()),
-    }
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The trainer: runs the stages one after the other, one optimiser step a call, and keeps the run's folder.
 //!
-//! `RUN/config.toml` the resolved configuration · `log.jsonl` a line every few steps · `samples/` grids ·
-//! `checkpoints/` all that is needed to continue · `model.safetensors` the result.
+//! `RUN/config.toml` the resolved configuration · `log.jsonl` and TensorBoard's `events.*` a line every few steps ·
+//! `samples/` grids · `checkpoints/` all that is needed to continue · `model.safetensors` the result.
 
 use std::{
     fs::OpenOptions,
@@ -19,6 +19,7 @@ use crate::{
     error::{Error, Result},
     eval::perceptual::Perceptual,
     files,
+    interop::tensorboard::EventFile,
     model::{file::Tensors, generator::Generator},
     train::{
         checkpoint::{CheckpointHeader, Checkpoints},
@@ -96,6 +97,8 @@ pub struct Trainer {
     current: Option<Current>,
     finished: Option<Start>,
     last_checkpoint: Option<PathBuf>,
+    /// Opened at the first step: a run that cannot begin leaves none.
+    tensorboard: Option<EventFile>,
 }
 
 struct Current {
@@ -147,7 +150,17 @@ impl Trainer {
         let stages = stages(&config, stage)?;
         let checkpoints = Checkpoints::of(run, 2);
         let (run, current, finished) = (run.to_owned(), None, None);
-        Ok(Self { config, inputs, run, stages, checkpoints, current, finished, last_checkpoint: None })
+        Ok(Self {
+            config,
+            inputs,
+            run,
+            stages,
+            checkpoints,
+            current,
+            finished,
+            last_checkpoint: None,
+            tensorboard: None,
+        })
     }
 
     /// The resolved configuration.
@@ -175,13 +188,15 @@ impl Trainer {
         }
         current.step += 1;
         let step = current.step;
+        let before = self.steps_before(current.position);
         let report = StepReport { stage, step, total, seconds: began.elapsed().as_secs_f64(), metrics };
         if step % self.config.log_steps == 0 || step == 1 || step == total {
             self.log(&report)?;
+            events.extend(self.tell_tensorboard(step, |file| file.scalars(before + step, report.scalars())));
         }
         events.push(Event::Step(report));
         if step % self.config.sample_steps == 0 || step == total {
-            events.push(self.write_samples(&current, stage));
+            events.extend(self.write_samples(&current, stage));
         }
         if step % self.config.checkpoint_steps == 0 || step == total {
             events.push(Event::Checkpoint(self.write_checkpoint(&current)?));
@@ -236,17 +251,26 @@ impl Trainer {
             .iter()
             .map(|stage| format!("{} {} steps", format!("{stage:?}").to_lowercase(), steps(&self.config, *stage)))
             .collect();
-        format!(
+        let own = format!(
             "trained by cnerf {}: {}; {} portraits; seed {}",
             env!("CARGO_PKG_VERSION"),
             stages.join(", "),
             self.inputs.dataset.len(),
             self.config.seed
-        )
+        );
+        match self.inputs.start.as_ref().and_then(|start| start.generator.header()) {
+            Some(start) => format!("{}; then {own}", start.provenance),
+            None => own,
+        }
+    }
+
+    /// Steps of the stages before the one at `position`.
+    fn steps_before(&self, position: usize) -> usize {
+        self.stages[..position].iter().map(|stage| steps(&self.config, *stage)).sum()
     }
 
     fn write_checkpoint(&mut self, current: &Current) -> Result<PathBuf> {
-        let before: usize = self.stages[..current.position].iter().map(|stage| steps(&self.config, *stage)).sum();
+        let before = self.steps_before(current.position);
         let header = CheckpointHeader { stage: self.stages[current.position], step: current.step };
         let mut tensors = Tensors::new();
         current.stage.save(&mut tensors)?;
@@ -256,18 +280,33 @@ impl Trainer {
     }
 
     /// A failed preview must not end hours of training.
-    fn write_samples(&self, current: &Current, stage: Stage) -> Event {
+    fn write_samples(&mut self, current: &Current, stage: Stage) -> Vec<Event> {
         let name = format!("{}-{:06}.png", format!("{stage:?}").to_lowercase(), current.step);
         let path = self.run.join("samples").join(name);
         let written = current.stage.samples().and_then(|picture| {
             let mut bytes = std::io::Cursor::new(Vec::new());
             picture.write_to(&mut bytes, image::ImageFormat::Png).map_err(|error| Error::malformed(&path, error))?;
-            files::write_atomically(&path, bytes.get_ref())
+            files::write_atomically(&path, bytes.get_ref())?;
+            Ok((picture.dimensions(), bytes.into_inner()))
         });
         match written {
-            Ok(()) => Event::Samples(path),
-            Err(error) => Event::Warning(format!("no sample grid at step {}: {error}", current.step)),
+            Ok(((width, height), png)) => {
+                let step = self.steps_before(current.position) + current.step;
+                let failed =
+                    self.tell_tensorboard(current.step, |file| file.png(step, "samples", [width, height], &png));
+                [Event::Samples(path)].into_iter().chain(failed).collect()
+            }
+            Err(error) => vec![Event::Warning(format!("no sample grid at step {}: {error}", current.step))],
         }
+    }
+
+    /// Curves and pictures for TensorBoard; training goes on without them.
+    fn tell_tensorboard(&mut self, step: usize, tell: impl FnOnce(&mut EventFile) -> Result<()>) -> Option<Event> {
+        let told = match self.tensorboard.take().map_or_else(|| EventFile::create(&self.run), Ok) {
+            Ok(mut file) => tell(&mut file).map(|()| self.tensorboard = Some(file)),
+            Err(error) => Err(error),
+        };
+        told.err().map(|error| Event::Warning(format!("nothing for TensorBoard at step {step}: {error}")))
     }
 
     fn log(&self, report: &StepReport) -> Result<()> {

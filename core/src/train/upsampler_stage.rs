@@ -1,40 +1,38 @@
 //! Stage `upsampler`: the field frozen, the 2D generator learns to lift its renders.
 //!
 //! Two teachers, mixed by their weights: the portrait a training code belongs to (shared/recipe: every warmed-up
-//! portrait's soft render is paired with its sharp photo; L1 and LPIPS on crops), and the high-resolution
-//! discriminator on random portraits (the paper's second stage).
+//! portrait's soft render is paired with its sharp photo; L1 and LPIPS on crops), and a high-resolution discriminator
+//! (the paper's second stage), which judges random portraits and, where there are pairs, their pictures too.
 
-use std::sync::Arc;
+mod adversary;
+mod pairs;
 
 use candle_core::{DType, Device, Tensor};
 use image::RgbImage;
 
+use self::{
+    adversary::{Adversary, Judged},
+    pairs::{Pairs, Square},
+};
 use crate::{
     camera::Camera,
     codes,
-    data::{
-        dataset::Dataset,
-        loader::{Cached, Draw, Loader, LoaderConfig},
-    },
     error::{Error, Result},
     eval::perceptual::Perceptual,
     model::{
-        discriminator::{Discriminator, DiscriminatorConfig, DiscriminatorKind},
         file::Tensors,
         generator::Generator,
-        upsampler::{Noise, Upsampler, UpsamplerOutput},
+        upsampler::{Noise, Upsampler},
     },
-    parameters::Parameters,
-    render::{Frame, RenderSettings, TwoPass},
+    render::Frame,
     rng::Stream,
     train::{
-        adversarial::{Auxiliary, PathLength, Pictures, R1Weights, discriminator_loss, generator_terms},
+        adversarial::PathLength,
         average::Average,
         config::{TrainConfig, UpsamplerStageConfig},
         events::Metrics,
         losses,
         optimiser::{Adam, Betas, Group},
-        portrait_codes::PortraitCodes,
         preview,
         trainer::{Inputs, StageRun, Start},
     },
@@ -42,8 +40,6 @@ use crate::{
 
 /// The first element of every stream drawn here.
 const STREAM: u64 = 0x7570_7361;
-/// Renders of training portraits are kept up to this many; beyond it they are rendered each time they are needed.
-const MOST_KEPT: usize = 2_500;
 /// LPIPS sees each crop shifted by up to this, pixels: AlexNet's stride of 4 with crops on even offsets draws stripes.
 const LARGEST_SHIFT: usize = 3;
 /// Path lengths are measured on a batch smaller by this (authors).
@@ -52,6 +48,9 @@ const PATH_BATCH_SHRINK: usize = 2;
 const PATH_DECAY: f64 = 0.01;
 /// Name of that mean in checkpoints.
 const PATH_MEAN: &str = "path_length_mean";
+
+/// Training portraits on a sample grid.
+const PREVIEWED: usize = 6;
 
 /// The running stage.
 pub struct UpsamplerStage {
@@ -64,33 +63,15 @@ pub struct UpsamplerStage {
     optimiser: Adam,
     /// Running mean of path lengths, a scalar.
     path_mean: Tensor,
-    paired: Option<Paired>,
+    pairs: Option<Pairs>,
     adversary: Option<Adversary>,
 }
 
-/// Training portraits with codes, and their renders.
-struct Paired {
-    portraits: Cached,
-    draws: Vec<Draw>,
-    codes: PortraitCodes,
-    renders: Vec<Option<Render>>,
-    kept: usize,
-}
-
-/// A render as the upsampler reads it, f16: half the memory, and an error far below the renders' own.
-#[derive(Clone)]
-struct Render {
-    values: Tensor,
-    has_normal: bool,
-}
-
-struct Adversary {
-    discriminator: Discriminator,
-    parameters: Parameters,
-    optimiser: Adam,
-    loader: Loader,
-    next_batch: usize,
-    source: (Arc<Dataset>, LoaderConfig),
+/// What a step's pairs give: their loss, and what a discriminator may see of them.
+struct PairedPictures {
+    loss: Tensor,
+    real: Judged,
+    fake: Judged,
 }
 
 impl UpsamplerStage {
@@ -113,43 +94,27 @@ impl UpsamplerStage {
         };
         let resolution = wanted.output_resolution;
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
-        let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
         let variables = generator.parameters().within("upsampler").variables();
-        let optimiser = Adam::new(vec![group(variables, stage.learning_rate)], betas);
-
-        let paired = (stage.pixels > 0.0 || stage.perceptual > 0.0)
-            .then(|| Paired::new(config, inputs, start.portrait_codes.as_ref(), resolution))
-            .transpose()?;
+        let group = Group { variables, learning_rate: stage.learning_rate, largest_gradient_norm: None };
+        let optimiser = Adam::new(vec![group], betas);
         if stage.perceptual > 0.0 && inputs.perceptual.is_none() {
             let reason = "needs LPIPS weights; pass --lpips FILE, or --set upsampler.perceptual=0";
             return Err(Error::config("upsampler.perceptual", reason));
         }
-        let adversary = (stage.adversarial > 0.0)
-            .then(|| {
-                let parameters = Parameters::fresh(config.seed, DType::F32, &inputs.device);
-                let discriminator = DiscriminatorConfig {
-                    kind: DiscriminatorKind::HighResolution,
-                    resolution,
-                    channel_multiplier: stage.channel_multiplier,
-                };
-                let discriminator = Discriminator::new(&discriminator, &parameters.within("discriminator"))?;
-                let loader = LoaderConfig {
-                    resolutions: vec![resolution],
-                    batch: stage.batch,
-                    mirror: config.mirror,
-                    seed: config.seed,
-                    ..LoaderConfig::default()
-                };
-                Ok::<_, Error>(Adversary {
-                    optimiser: Adam::new(vec![group(parameters.variables(), stage.discriminator_learning_rate)], betas),
-                    discriminator,
-                    parameters,
-                    loader: Loader::new(Arc::clone(&inputs.dataset), &loader)?,
-                    next_batch: 0,
-                    source: (Arc::clone(&inputs.dataset), loader),
-                })
-            })
+        let pairs = (stage.pixels > 0.0 || stage.perceptual > 0.0)
+            .then(|| Pairs::new(config, inputs, start.portrait_codes.as_ref(), resolution))
             .transpose()?;
+        let adversary = (stage.adversarial > 0.0)
+            .then(|| Adversary::new(config, inputs, resolution, pairs.is_none()))
+            .transpose()?;
+        let seen = stage.crop.min(wanted.input_resolution) * resolution / wanted.input_resolution;
+        if adversary.is_some() && stage.adversarial_crop.min(resolution) > seen {
+            let reason = format!("must be at most {seen}, what a crop of {} shows", stage.crop);
+            return Err(Error::config("upsampler.adversarial_crop", reason));
+        }
+        if adversary.is_some() && pairs.is_none() && stage.random_portraits == 0 {
+            return Err(Error::config("upsampler.random_portraits", "must be at least 1 where there are no pairs"));
+        }
         Ok(Self {
             average: Average::of(&generator.parameters().within("upsampler"), stage.average_half_life_images)?,
             config: stage,
@@ -159,90 +124,62 @@ impl UpsamplerStage {
             perceptual: inputs.perceptual.clone(),
             optimiser,
             path_mean: Tensor::zeros((), DType::F32, &inputs.device)?,
-            paired,
+            pairs,
             adversary,
         })
     }
 
-    /// Losses against the portraits that training codes belong to.
-    fn paired_loss(&mut self, step: usize, metrics: &mut Metrics) -> Result<Option<Tensor>> {
-        let Some(paired) = &mut self.paired else { return Ok(None) };
+    /// Lifts renders of training portraits and compares them with the photos.
+    fn paired_pictures(&mut self, step: usize, metrics: &mut Metrics) -> Result<Option<PairedPictures>> {
+        let Some(pairs) = &mut self.pairs else { return Ok(None) };
         let config = &self.config;
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 0]);
-        let render_resolution = self.generator.render_resolution();
-        let factor = self.generator.output_resolution() / render_resolution;
-        let rows = random.permutation(paired.draws.len());
-        let rows = &rows[..config.batch.min(rows.len())];
-        let crop = config.crop.min(render_resolution);
-        let left = random.below(render_resolution - crop + 1);
-        let top = random.below(render_resolution - crop + 1);
-        let frames = rows.iter().map(|row| paired.render(&self.generator, *row)).collect::<Result<Vec<_>>>()?;
-        let frame = Render::batch(&frames, &self.device)?.crop(left, top, crop)?;
-        let draws: Vec<Draw> = rows.iter().map(|row| paired.draws[*row]).collect();
-        let resolution = self.generator.output_resolution();
-        let batch = paired.portraits.batch(step as u64, &draws)?;
-        let target = batch.at(resolution)?.images.to_device(&self.device)?;
-        let target =
-            target.narrow(2, top * factor, crop * factor)?.narrow(3, left * factor, crop * factor)?.contiguous()?;
-        let rows: Vec<u32> = rows.iter().map(|row| *row as u32).collect();
-        let codes = paired.codes.codes(&self.generator, &rows)?.detach();
-        let output = self.generator.upsample(&frame, &codes, None)?;
+        let batch = pairs.batch(&self.generator, config.batch, config.crop, step, &mut random)?;
+        let output = self.generator.upsample(&batch.frame, &batch.codes, None)?;
 
-        let pixels = (losses::colour_l1(&output.rgb, &target)? * 2.0)?;
-        metrics.push("pixels", scalar(&pixels)?);
-        let mut total = (&pixels * config.pixels)?;
+        let pixels = (losses::colour_l1(&output.rgb, &batch.photo)? * 2.0)?;
+        metrics.push_loss("pixels", &pixels)?;
+        let mut loss = (&pixels * config.pixels)?;
         if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0) {
             let [x, y] = [random.below(LARGEST_SHIFT + 1), random.below(LARGEST_SHIFT + 1)];
-            let side = crop * factor;
-            let side = side - LARGEST_SHIFT;
+            let side = batch.photo.dim(2)? - LARGEST_SHIFT;
             let zoom = f64::from(random.range(1.0, config.perceptual_zoom as f32));
             let enlarged = enlargement(side, (side as f64 * zoom).round() as usize, &self.device)?;
             let view = |picture: &Tensor| -> Result<Tensor> {
                 let crop = picture.narrow(2, y, side)?.narrow(3, x, side)?.contiguous()?;
                 Ok(enlarged.broadcast_matmul(&crop)?.broadcast_matmul(&enlarged.t()?)?)
             };
-            let distance = perceptual.distance(&view(&output.rgb)?, &view(&target)?)?.mean_all()?;
-            metrics.push("perceptual", scalar(&distance)?);
-            total = (total + (distance * config.perceptual)?)?;
+            let distance = perceptual.distance(&view(&output.rgb)?, &view(&batch.photo)?)?.mean_all()?;
+            metrics.push_loss("perceptual", &distance)?;
+            loss = (loss + (distance * config.perceptual)?)?;
         }
-        Ok(Some(total))
+        let real = Judged { image: batch.photo, masks: batch.masks };
+        let fake = Judged { image: output.rgb, masks: output.masks };
+        Ok(Some(PairedPictures { loss, real, fake }))
     }
 
     /// Trains the discriminator and returns the generator's adversarial loss.
-    fn adversarial_loss(&mut self, step: usize, metrics: &mut Metrics) -> Result<Option<Tensor>> {
-        let Some(mut adversary) = self.adversary.take() else { return Ok(None) };
-        let loss = self.judge(&mut adversary, step, metrics);
-        self.adversary = Some(adversary);
-        loss.map(Some)
-    }
-
-    fn judge(&self, adversary: &mut Adversary, step: usize, metrics: &mut Metrics) -> Result<Tensor> {
-        let config = &self.config;
-        if step != adversary.next_batch {
-            adversary.loader = Loader::resume(Arc::clone(&adversary.source.0), &adversary.source.1, step as u64)?;
+    fn adversarial_loss(
+        &mut self,
+        step: usize,
+        paired: Option<(Judged, Judged)>,
+        metrics: &mut Metrics,
+    ) -> Result<Option<Tensor>> {
+        if self.adversary.is_none() {
+            return Ok(None);
         }
-        adversary.next_batch = step + 1;
-        let real = adversary.loader.next_batch()?;
-        let real = real.at(self.generator.output_resolution())?;
-        let (real_image, real_masks) = (real.images.to_device(&self.device)?, real.masks.to_device(&self.device)?);
-        let fake = self.random_pictures(&mut Stream::new(self.seed, &[STREAM, step as u64, 1]))?;
-        let (image, masks) = (fake.rgb.detach(), fake.masks.detach());
-        let weights = R1Weights { image: config.r1_image, masks: config.r1_mask };
-        let penalty = step.is_multiple_of(config.r1_steps.max(1)).then(|| weights.every(config.r1_steps.max(1)));
-        let loss = discriminator_loss(
-            &adversary.discriminator,
-            Pictures { image: &real_image, masks: &real_masks },
-            Pictures { image: &image, masks: &masks },
-            Auxiliary::None,
-            penalty,
-        )?;
-        metrics.push("discriminator", scalar(&loss.logistic)?);
-        finite(metrics)?;
-        adversary.optimiser.step(&loss.total.backward()?, 1.0)?;
-        let pictures = Pictures { image: &fake.rgb, masks: &fake.masks };
-        let terms = generator_terms(&adversary.discriminator, pictures, Auxiliary::None)?;
-        metrics.push("adversarial", scalar(&terms.adversarial)?);
-        Ok((terms.total * config.adversarial)?)
+        let random_portraits = (self.config.random_portraits > 0)
+            .then(|| self.random_pictures(&mut Stream::new(self.seed, &[STREAM, step as u64, 1])))
+            .transpose()?;
+        let Some(adversary) = &mut self.adversary else { return Ok(None) };
+        let (real, fake) = match (paired, random_portraits) {
+            (Some((real, fake)), Some(random)) => (Some(real), Some(fake.and(&random)?)),
+            (Some((real, fake)), None) => (Some(real), Some(fake)),
+            (None, random) => (adversary.photos(step)?, random),
+        };
+        let (Some(real), Some(fake)) = (real, fake) else { return Ok(None) };
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64, 3]);
+        adversary.judge(&self.config, step, [&real, &fake], &mut random, metrics)
     }
 
     /// Path-length regularisation (StyleGAN2): a step in w moves the picture by about the same amount everywhere.
@@ -264,7 +201,7 @@ impl UpsamplerStage {
         let pixels = (output.rgb.dim(2)? * output.rgb.dim(3)?) as f64;
         let direction = (random.normal_tensor(output.rgb.dims(), &self.device)? / pixels.sqrt())?;
         let path = PathLength::new(&network.latent_gradient(&trace, &direction)?, &self.path_mean, PATH_DECAY)?;
-        metrics.push("path_length", scalar(&path.penalty)?);
+        metrics.push_loss("path_length", &path.penalty)?;
         self.path_mean = path.mean;
         Ok(Some((path.penalty * (config.path_length * every as f64))?))
     }
@@ -278,104 +215,31 @@ impl UpsamplerStage {
             .map(|_| Camera::at(f64::from(random.normal()) * azimuth, f64::from(random.normal()) * elevation))
             .collect();
         let cameras = Camera::parameter_tensor(&cameras, &self.device)?;
-        Ok((self.generator.render(&codes, &cameras, &self.generator.render_settings())?, codes))
+        Ok((self.generator.render(&codes, &cameras, &pairs::settings(&self.generator))?, codes))
     }
 
-    /// Finished pictures of random portraits from random cameras.
-    fn random_pictures(&self, random: &mut Stream) -> Result<UpsamplerOutput> {
-        let (frame, codes) = self.random_renders(self.config.batch, random)?;
-        self.generator.upsample_with(&frame, &codes, None, Noise::Drawn(random))
-    }
-}
-
-impl Paired {
-    fn new(config: &TrainConfig, inputs: &Inputs, codes: Option<&PortraitCodes>, resolution: usize) -> Result<Self> {
-        let count = inputs.dataset.len();
-        let draws: Vec<Draw> = [false, true][..if config.mirror { 2 } else { 1 }]
-            .iter()
-            .flat_map(|mirrored| (0..count).map(|index| Draw { index, mirrored: *mirrored }))
-            .collect();
-        let codes = codes.filter(|codes| codes.count() == draws.len()).ok_or_else(|| {
-            let reason = "pairs need the codes a warm-up on the same data left beside its model; \
-                          run --stage all, or --set upsampler.pixels=0 upsampler.perceptual=0";
-            Error::config("upsampler.pixels", reason)
-        })?;
-        let portraits = Cached::new(&inputs.dataset, &[resolution], &|_| ())?;
-        let renders = vec![None; draws.len()];
-        Ok(Self { portraits, draws, codes: codes.clone(), renders, kept: 0 })
-    }
-
-    /// The render of a training portrait from its own camera.
-    fn render(&mut self, generator: &Generator, row: usize) -> Result<Render> {
-        if let Some(Some(render)) = self.renders.get(row) {
-            return Ok(render.clone());
-        }
-        let codes = self.codes.codes(generator, &[row as u32])?;
-        let camera = self.portraits.camera(self.draws[row]).unwrap_or_default();
-        let cameras = Camera::parameter_tensor(&[camera], &generator.device())?;
-        let settings = RenderSettings { two_pass: Some(TwoPass::default()), ..generator.render_settings() };
-        let render = Render::of(&generator.render(&codes, &cameras, &settings)?)?;
-        if self.kept < MOST_KEPT {
-            self.kept += 1;
-            self.renders[row] = Some(render.clone());
-        }
-        Ok(render)
-    }
-}
-
-impl Render {
-    fn of(frame: &Frame) -> Result<Self> {
-        let features = frame.features.as_ref().ok_or_else(|| Error::config("features", "were not rendered"))?;
-        let mut parts = vec![&frame.colour, &frame.masks, &frame.depth, &frame.point, &frame.opacity, features];
-        parts.extend(frame.normal.as_ref());
-        let values = Tensor::cat(&parts, 1)?.to_dtype(DType::F16)?.detach();
-        Ok(Self { values, has_normal: frame.normal.is_some() })
-    }
-
-    /// The frame of several renders.
-    fn batch(renders: &[Self], device: &Device) -> Result<FrameBatch> {
-        let has_normal = renders.iter().all(|render| render.has_normal);
-        let values: Vec<&Tensor> = renders.iter().map(|render| &render.values).collect();
-        Ok(FrameBatch { values: Tensor::cat(&values, 0)?.to_device(device)?.to_dtype(DType::F32)?, has_normal })
-    }
-}
-
-struct FrameBatch {
-    values: Tensor,
-    has_normal: bool,
-}
-
-impl FrameBatch {
-    /// The square of `side` pixels from (`left`, `top`) of all renders.
-    fn crop(&self, left: usize, top: usize, side: usize) -> Result<Frame> {
-        let values = self.values.narrow(2, top, side)?.narrow(3, left, side)?;
-        let channels = values.dim(1)?;
-        let normals = if self.has_normal { 3 } else { 0 };
-        let part = |first: usize, count: usize| values.narrow(1, first, count)?.contiguous();
-        Ok(Frame {
-            colour: part(0, 3)?,
-            masks: part(3, 9)?,
-            depth: part(12, 1)?,
-            point: part(13, 3)?,
-            opacity: part(16, 1)?,
-            features: Some(part(17, channels - 17 - normals)?),
-            normal: if self.has_normal { Some(part(channels - 3, 3)?) } else { None },
-        })
+    /// Pictures of random portraits from random cameras: the square a step's pairs would show.
+    fn random_pictures(&self, random: &mut Stream) -> Result<Judged> {
+        let (frame, codes) = self.random_renders(self.config.random_portraits, random)?;
+        let frame = Square::random(self.config.crop, self.generator.render_resolution(), random).of_frame(&frame)?;
+        let output = self.generator.upsample_with(&frame, &codes, None, Noise::Drawn(random))?;
+        Ok(Judged { image: output.rgb, masks: output.masks })
     }
 }
 
 impl StageRun for UpsamplerStage {
     fn step(&mut self, step: usize) -> Result<Metrics> {
         let mut metrics = Metrics::default();
-        let losses = [
-            self.paired_loss(step, &mut metrics)?,
-            self.adversarial_loss(step, &mut metrics)?,
-            self.path_length(step, &mut metrics)?,
-        ];
+        let (paired_loss, pictures) = match self.paired_pictures(step, &mut metrics)? {
+            Some(paired) => (Some(paired.loss), Some((paired.real, paired.fake))),
+            None => (None, None),
+        };
+        let losses =
+            [paired_loss, self.adversarial_loss(step, pictures, &mut metrics)?, self.path_length(step, &mut metrics)?];
         let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
         let total =
             total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
-        finite(&metrics)?;
+        metrics.check_finite()?;
         let factor = self.config.schedule.factor(step, self.config.steps);
         let norms = self.optimiser.step(&total.backward()?, factor)?;
         metrics.push("gradient_norm", norms.iter().sum());
@@ -388,8 +252,7 @@ impl StageRun for UpsamplerStage {
         self.average.save(tensors);
         tensors.insert(PATH_MEAN.to_owned(), self.path_mean.reshape(1)?);
         if let Some(adversary) = &self.adversary {
-            tensors.extend(adversary.parameters.snapshot()?);
-            adversary.optimiser.save("adam_discriminator", tensors)?;
+            adversary.save(tensors)?;
         }
         self.optimiser.save("adam", tensors)
     }
@@ -400,26 +263,22 @@ impl StageRun for UpsamplerStage {
         let mean = tensors.get(PATH_MEAN).ok_or_else(|| Error::shape(PATH_MEAN, [1], &[]))?;
         self.path_mean = mean.to_device(&self.device)?.reshape(())?;
         if let Some(adversary) = &mut self.adversary {
-            adversary.parameters.restore(tensors)?;
-            adversary.optimiser.load("adam_discriminator", tensors)?;
+            adversary.load(tensors)?;
         }
         self.optimiser.load("adam", tensors)
     }
 
     fn samples(&self) -> Result<RgbImage> {
         let finished = self.finished()?.generator;
-        let Some(paired) = &self.paired else { return preview::random_grid(&finished) };
-        let count = paired.portraits.len().min(6);
-        let rows: Vec<u32> = (0..count).map(|index| (index * paired.portraits.len() / count) as u32).collect();
-        let cameras: Vec<Camera> =
-            rows.iter().map(|row| paired.portraits.camera(paired.draws[*row as usize]).unwrap_or_default()).collect();
-        preview::grid(&finished, &paired.codes.codes(&finished, &rows)?, &cameras)
+        let Some(pairs) = &self.pairs else { return preview::random_grid(&finished) };
+        let (rows, cameras) = pairs.spread(PREVIEWED);
+        preview::grid(&finished, &pairs.codes().codes(&finished, &rows)?, &cameras)
     }
 
     fn finished(&self) -> Result<Start> {
         let generator = self.generator.duplicate()?;
         self.average.apply(&generator.parameters().within("upsampler"))?;
-        Ok(Start { generator, portrait_codes: self.paired.as_ref().map(|paired| paired.codes.clone()) })
+        Ok(Start { generator, portrait_codes: self.pairs.as_ref().map(|pairs| pairs.codes().clone()) })
     }
 }
 
@@ -437,20 +296,16 @@ fn enlargement(source: usize, target: usize, device: &Device) -> Result<Tensor> 
     Ok(Tensor::from_vec(weights, (target, source), device)?)
 }
 
-fn scalar(loss: &Tensor) -> Result<f64> {
-    Ok(f64::from(loss.to_dtype(DType::F32)?.to_scalar::<f32>()?))
-}
-
-fn finite(metrics: &Metrics) -> Result<()> {
-    match metrics.first_not_finite() {
-        Some(quantity) => Err(Error::not_finite(format!("loss term {quantity}"))),
-        None => Ok(()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
+    use crate::{
+        data::dataset::Dataset,
+        parameters::Parameters,
+        train::{config::Preset, portrait_codes::PortraitCodes, test_data::dataset},
+    };
 
     #[test]
     fn enlargement_keeps_ramps_and_is_the_identity_at_one() {
@@ -463,5 +318,69 @@ mod tests {
             let expected = ((row as f32 + 0.5) * 8.0 / 13.0 - 0.5).clamp(0.0, 7.0);
             assert!((value - expected).abs() < 1e-5, "{row}: {value}, {expected}");
         }
+    }
+
+    /// A tiny stage with a discriminator, from a field with codes of its own for 4 portraits and their mirror images.
+    fn stage(portraits: &Arc<Dataset>, settings: &[&str]) -> UpsamplerStage {
+        let mut config = TrainConfig::preset(Preset::Tiny);
+        config.upsampler.channel_multiplier = 1.0 / 128.0;
+        let settings: Vec<String> = settings.iter().map(|setting| format!("upsampler.{setting}")).collect();
+        let config = config.with(&settings).unwrap();
+        let mut random = Stream::new(4, &[]);
+        let start = Start {
+            generator: Generator::new(&config.model, &Parameters::fresh(1, DType::F32, &Device::Cpu)).unwrap(),
+            portrait_codes: Some(PortraitCodes {
+                noise: random.normal_tensor(&[8, config.model.field.style_dim], &Device::Cpu).unwrap(),
+                offsets: None,
+            }),
+        };
+        let inputs = Inputs { dataset: Arc::clone(portraits), perceptual: None, start: None, device: Device::Cpu };
+        UpsamplerStage::new(&config, &inputs, Some(&start)).unwrap()
+    }
+
+    /// Everything that changes from step to step.
+    fn state(stage: &UpsamplerStage) -> Vec<f64> {
+        let mut tensors = Tensors::new();
+        stage.save(&mut tensors).unwrap();
+        let numbers = |tensor: &Tensor| tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();
+        tensors.values().flat_map(|tensor| numbers(tensor).unwrap()).collect()
+    }
+
+    #[test]
+    fn with_pairs_or_without_a_discriminator_teaches_and_a_stop_changes_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let portraits = dataset(folder.path(), 4);
+        let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
+        let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=0", "random_portraits=2"];
+        for (settings, quantities) in [
+            (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
+            (alone, &["discriminator", "adversarial"][..]),
+        ] {
+            let mut whole = stage(&portraits, &settings);
+            let before = state(&whole);
+            (0..3).for_each(|step| drop(whole.step(step).unwrap()));
+            let metrics = whole.step(3).unwrap();
+            for quantity in quantities {
+                assert!(metrics.get(quantity).is_some_and(f64::is_finite), "{quantity} of {metrics:?}");
+            }
+            assert!(state(&whole) != before);
+            let mut first = stage(&portraits, &settings);
+            (0..2).for_each(|step| drop(first.step(step).unwrap()));
+            let mut saved = Tensors::new();
+            first.save(&mut saved).unwrap();
+            let mut second = stage(&portraits, &settings);
+            second.load(&saved).unwrap();
+            (2..4).for_each(|step| drop(second.step(step).unwrap()));
+            assert!(state(&second) == state(&whole), "a stop changed what was learnt");
+        }
+    }
+
+    #[test]
+    fn the_discriminator_runs_ahead_before_it_is_heard() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut stage = stage(&dataset(folder.path(), 4), &["adversarial=0.1", "discriminator_ahead_steps=1"]);
+        let heard = |metrics: Metrics| metrics.get("adversarial").is_some();
+        assert!(!heard(stage.step(0).unwrap()));
+        assert!(heard(stage.step(1).unwrap()));
     }
 }
