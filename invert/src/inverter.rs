@@ -393,20 +393,28 @@ pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, perceptual
     let grey = RgbImage::from_pixel(side, side, image::Rgb([128; 3]));
     let target = Target::new(&grey, None, generator, perceptual)?;
     let steps = config.steps();
-    // A pivot of a single step takes it on rays, with as many rays as the effort has.
-    let single = InvertConfig { pivot_steps: Some(1), ..config.clone() };
-    let mut pivot = Pivot::new(generator, &[Camera::default()], &single)?;
-    let started = Instant::now();
-    pivot.step(generator, std::slice::from_ref(&target))?;
-    let on_rays = started.elapsed().as_secs_f64();
-    let started = Instant::now();
+    // A pivot of two steps takes them on rays, with as many rays as the effort has.
+    let short = InvertConfig { pivot_steps: Some(2), ..config.clone() };
+    let mut pivot = Pivot::new(generator, &[Camera::default()], &short)?;
+    let prepared = began.elapsed();
+    let on_rays = warm_seconds(|| pivot.step(generator, std::slice::from_ref(&target)).map(drop))?;
     let view = Camera::parameter_tensor(&[Camera::default()], &generator.device())?;
-    pivot.whole_loss(generator, &target, &view)?.total.backward()?;
-    let whole = started.elapsed().as_secs_f64();
+    let whole = warm_seconds(|| {
+        pivot.whole_loss(generator, &target, &view)?.total.backward()?;
+        Ok(())
+    })?;
     let steps_on_rays = (steps.shared + steps.free) as f64;
     // What was done here is done again: the space of codes, the target's features.
-    let rest = began.elapsed().as_secs_f64() - on_rays - whole;
+    let rest = prepared.as_secs_f64();
     Ok(rest + on_rays * steps_on_rays + whole * (steps.whole as f64 + TUNE_SHARE * steps.tune as f64))
+}
+
+/// Seconds of the second of two runs: the first also takes memory from the system and wakes threads, several times over.
+fn warm_seconds(mut step: impl FnMut() -> Result<()>) -> Result<f64> {
+    step()?;
+    let started = Instant::now();
+    step()?;
+    Ok(started.elapsed().as_secs_f64())
 }
 
 fn psnr(found: &Tensor, photo: &Tensor) -> Result<f64> {
