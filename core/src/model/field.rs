@@ -19,7 +19,7 @@ use crate::{
     region::{REGION_COUNT, RegionSet},
     render::{
         BackgroundEvaluation, Evaluation, RadianceField, norm,
-        plan::{LocalField, LocalInitial, LocalWeights},
+        plan::{LocalFeatures, LocalField, LocalInitial, LocalWeights},
     },
 };
 
@@ -277,6 +277,14 @@ pub struct PortraitField {
 }
 
 impl PortraitField {
+    fn local_features(&self) -> Result<LocalFeatures> {
+        let (weight, bias) = &self.feature;
+        let (_, count, columns) = weight.dims3()?;
+        let values = |tensor: &Tensor| -> Result<Vec<f32>> { Ok(tensor.flatten_all()?.to_vec1()?) };
+        let (weight, bias) = (values(weight)?, values(bias)?);
+        Ok(LocalFeatures { count, columns, weight, bias, sees_view: self.config.feature_view_input })
+    }
+
     /// Without a gradient from the initial network's distance to the codes, as the authors train and invert.
     #[must_use]
     pub fn with_frozen_initial_distance(mut self) -> Self {
@@ -480,6 +488,7 @@ impl RadianceField for PortraitField {
             residual_scale: self.config.residual_scale,
             density: self.config.density,
             inverse_alpha: bounded(&self.log_alpha)?.neg()?.exp()?.squeeze(0)?.to_scalar::<f32>()?,
+            features: self.local_features()?,
         }))
     }
 

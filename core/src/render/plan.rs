@@ -38,7 +38,7 @@ use serde::{Deserialize, Serialize};
 
 use self::{
     local::Ready,
-    march::Marched,
+    march::{Allowance, Marched},
     rays::Rays,
     select::Selection,
     shade::Pixels,
@@ -62,7 +62,7 @@ mod shade;
 mod state;
 mod whole;
 
-pub use local::{LocalField, LocalInitial, LocalWeights};
+pub use local::{LocalFeatures, LocalField, LocalInitial, LocalWeights};
 pub use sequence::Sequence;
 pub use session::Session;
 
@@ -72,6 +72,8 @@ const CHUNK_RAYS: usize = 512;
 const CHUNKS_AT_ONCE: usize = 16;
 /// The share of a budget that may be spent on ending rays early; light falls so fast that more would gain little.
 const CUT_SHARE: f64 = 0.25;
+/// The share that may be spent on space that is proven to be almost empty.
+const EMPTY_SHARE: f64 = 0.125;
 /// Budgets up to here are rendered exhaustively: what rounding may add to a plan's difference from the exhaustive path,
 /// in [0, 1] colour units. Both round the same sums in another order: a weight's relative error is that of an optical
 /// depth t of S terms, at most S t 2⁻²⁴, and t exp(-t) ≤ 0.37; sigmoids and weighted sums of values in [0, 1] add a few
@@ -212,7 +214,7 @@ pub fn render<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSe
                 .collect::<Result<_>>()?;
             for ((rays, chunk), range) in chunks.iter().zip(wave) {
                 report = report.and(chunk.report(&ready, rays, settings.budget));
-                parts.push(field, &view, image, *range, &chunk.pixels)?;
+                parts.push(&view, image, *range, &chunk.pixels)?;
             }
         }
     }
@@ -252,7 +254,7 @@ fn exhaustive<F: RadianceField>(
                 .map(|range| whole::render(&ready, &view.rays(image, *range)?, &shown))
                 .collect::<Result<_>>()?;
             for (pixels, range) in chunks.iter().zip(wave) {
-                parts.push(field, &view, image, *range, pixels)?;
+                parts.push(&view, image, *range, pixels)?;
             }
         }
     }
@@ -316,8 +318,8 @@ struct Chunk {
 impl Chunk {
     fn render(ready: &Ready, rays: &Rays, shown: Shown, budget: f64, state: &mut ChunkState) -> Result<Self> {
         let mut room = Room::default();
-        let spendable = (budget - ROUNDING).max(0.0);
-        let marched = march::march(ready, rays, (spendable * CUT_SHARE) as f32, state, &mut room)?;
+        let allowance = Allowance::of((budget - ROUNDING).max(0.0), rays.samples);
+        let marched = march::march(ready, rays, allowance, state, &mut room)?;
         let selection = select::select(ready, rays, &marched, &shown, budget as f32);
         let pixels = shade::shade(ready, rays, &marched, &selection, &shown, state, &mut room)?;
         Ok(Self { marched, selection, pixels })
@@ -355,30 +357,17 @@ struct Parts {
 }
 
 impl Parts {
-    fn push<F: RadianceField>(
-        &mut self,
-        field: &F,
-        view: &View,
-        image: usize,
-        (start, count): (usize, usize),
-        pixels: &Pixels,
-    ) -> Result<()> {
+    fn push(&mut self, view: &View, image: usize, (start, count): (usize, usize), pixels: &Pixels) -> Result<()> {
         let rows = |values: &[f32], channels: usize| -> Result<Tensor> {
             Ok(Tensor::from_vec(transposed(values, count, channels), (1, channels, count), &Device::Cpu)?)
         };
         self.colour.push(rows(&pixels.colour, 3)?.affine(2.0, -1.0)?);
-        let masks = rows(&pixels.masks, REGION_COUNT)?;
         let bundle = view.bundle.narrow(start, count)?;
         let directions = bundle.directions.narrow(0, image, 1)?;
         if view.settings.features {
-            let width = pixels.activations.len() / (count * REGION_COUNT).max(1);
-            let activations = rows(&pixels.activations, REGION_COUNT * width)?;
-            let activations = activations.reshape((1, REGION_COUNT, width, count))?;
-            let views = bundle.view_directions.narrow(0, image, 1)?;
-            // Weights of features are all portraits', so the picture's number does not matter.
-            self.features.push(field.features(&activations, &masks, Some(&views))?.detach());
+            self.features.push(rows(&pixels.features, pixels.features.len() / count.max(1))?);
         }
-        self.masks.push(masks);
+        self.masks.push(rows(&pixels.masks, REGION_COUNT)?);
         self.depth.push(rows(&pixels.depth, 1)?);
         if view.settings.normals {
             self.normal.push(rows(&pixels.normal, 3)?);

@@ -4,6 +4,9 @@
 //! from the vertices with a safety factor, not proven: intervals pushed through three sine layers whose angles change by
 //! several radians across a cell cover [-1, 1], so proven bounds say nothing at cells that are affordable (see the
 //! test `proven_bounds_of_a_cell_say_nothing_at_affordable_sizes`).
+//!
+//! There are two levels, each made this way: the fine one is evaluated around the surface alone, where the coarse one
+//! sees neither empty space nor the inside.
 
 use rayon::prelude::*;
 
@@ -14,8 +17,12 @@ use crate::{
     render::plan::local::{Ready, scaled},
 };
 
-/// Cells along the longest side. A head of 0.06 units' radius is then some twenty cells across.
-const CELLS: usize = 56;
+/// Coarse cells along the longest side. A head of 0.06 units' radius is then some ten cells across.
+const COARSE_CELLS: usize = 28;
+/// Fine cells along a coarse one.
+const FINENESS: usize = 2;
+/// Depth below the surface, in units of α, behind which no light is left to see anything by.
+const DEEP: f32 = 8.0;
 /// What estimates from the vertices are multiplied by.
 pub const SAFETY: f32 = 2.0;
 /// Vertices evaluated at once.
@@ -38,6 +45,8 @@ pub struct Grid {
     raw: Vec<f32>,
     /// Per cell.
     estimates: Vec<CellEstimate>,
+    /// Vertices, of both levels, at which the field was evaluated; the others are interpolated.
+    evaluated: usize,
 }
 
 /// What is estimated of a cell.
@@ -51,6 +60,8 @@ pub struct CellEstimate {
     pub left_out: f32,
     /// The regions that have to be evaluated where the whole has to, as bits.
     pub relevant: u16,
+    /// The least that the signed distance may be anywhere in the cell, world units.
+    pub nearest: f32,
 }
 
 /// Where a point lies in the grid.
@@ -81,29 +92,42 @@ struct VertexEstimate {
 
 impl Grid {
     /// The grid of `field`, which has no initial network and no masks that see the view, over the box `low .. high`,
-    /// world. In each cell regions may be interpolated whose effects sum to at most `negligible`, [0, 1] colour units.
-    pub fn new(field: &Ready, low: [f32; 3], high: [f32; 3], negligible: f32) -> Result<Self> {
+    /// world. In each cell regions may be interpolated whose effects sum to at most `negligible`, [0, 1] colour units;
+    /// what is as far from the surface as `empty_from`, world units, nobody will look at closely.
+    pub fn new(field: &Ready, low: [f32; 3], high: [f32; 3], negligible: f32, empty_from: f32) -> Result<Self> {
         let extent: [f32; 3] = std::array::from_fn(|axis| (high[axis] - low[axis]).max(1e-6));
-        let cell = extent.iter().fold(0f32, |longest, side| longest.max(*side)) / CELLS as f32;
-        let cells = extent.map(|side| ((side / cell).ceil() as usize).clamp(1, CELLS));
-        let mut grid = Self {
+        let cell = extent.iter().fold(0f32, |longest, side| longest.max(*side)) / COARSE_CELLS as f32;
+        let cells = extent.map(|side| ((side / cell).ceil() as usize).clamp(1, COARSE_CELLS));
+        let mut coarse = Self::empty(field, low, cell, cells);
+        coarse.fill(field, None)?;
+        coarse.estimates = coarse.estimate(field, negligible, None);
+
+        let mut fine = Self::empty(field, low, cell / FINENESS as f32, cells.map(|cells| cells * FINENESS));
+        let near = coarse.near(field, empty_from);
+        fine.fill(field, Some((&coarse, &near)))?;
+        fine.estimates = fine.estimate(field, negligible, Some((&coarse, &near)));
+        fine.evaluated += coarse.evaluated;
+        Ok(fine)
+    }
+
+    fn empty(field: &Ready, low: [f32; 3], cell: f32, cells: [usize; 3]) -> Self {
+        let regions = field.regions.len();
+        let vertices = cells.iter().map(|cells| cells + 1).product::<usize>();
+        Self {
             low,
             cell,
             cells,
-            regions: field.regions.len(),
-            distances: Vec::new(),
-            raw: Vec::new(),
+            regions,
+            distances: vec![0.0; vertices],
+            raw: vec![0.0; vertices * regions * 2],
             estimates: Vec::new(),
-        };
-        let vertices = grid.vertices(field)?;
-        (grid.distances, grid.raw) = (vertices.distances, vertices.raw);
-        grid.estimates = grid.estimate(field, negligible);
-        Ok(grid)
+            evaluated: 0,
+        }
     }
 
     /// Shape branches that were run for it: one a vertex and region.
     pub fn pairs(&self) -> usize {
-        self.distances.len() * self.regions
+        self.evaluated * self.regions
     }
 
     /// Values kept.
@@ -154,6 +178,13 @@ impl Grid {
         &self.estimates[place.cell]
     }
 
+    /// The most extreme signed distance at a cell's corners; NaN if any is.
+    fn furthest(&self, place: Place, is_further: impl Fn(f32, f32) -> bool) -> f32 {
+        let distances = self.corners(place).map(|(vertex, _)| self.distances[vertex]);
+        let further = |kept: f32, own: f32| if own.is_nan() || is_further(own, kept) { own } else { kept };
+        distances.reduce(further).unwrap_or(f32::NAN)
+    }
+
     fn vertex(&self, index: [usize; 3]) -> usize {
         (index[2] * (self.cells[1] + 1) + index[1]) * (self.cells[0] + 1) + index[0]
     }
@@ -181,84 +212,168 @@ impl Grid {
         })
     }
 
-    fn vertices(&self, field: &Ready) -> Result<Vertices> {
-        let (columns, regions) = (field.columns(), self.regions);
-        let counts = self.cells.map(|cells| cells + 1);
-        let total = counts.iter().product::<usize>();
-        let position = |vertex: usize| -> [f32; 3] {
-            let index = [vertex % counts[0], vertex / counts[0] % counts[1], vertex / (counts[0] * counts[1])];
-            std::array::from_fn(|axis| self.low[axis] + self.cell * index[axis] as f32)
+    /// Per cell, whether light may end in it.
+    fn near(&self, field: &Ready, empty_from: f32) -> Vec<bool> {
+        let deep = -DEEP / field.local.inverse_alpha;
+        let is_near = |cell: usize| {
+            let (index, estimate) = (self.index(cell), &self.estimates[cell]);
+            let place = Place { cell, vertex: self.vertex(index), fraction: [0.5; 3] };
+            let deepest = self.furthest(place, |distance, deepest| distance > deepest);
+            // Not the other way round: NaN must be looked at.
+            let is_far = estimate.nearest >= empty_from || deepest + estimate.distance <= deep;
+            !is_far
         };
-        let starts: Vec<usize> = (0..total).step_by(VERTICES_AT_ONCE).collect();
-        let blocks: Vec<Result<Vertices>> = starts
-            .into_par_iter()
-            .map(|start| {
-                let points: Vec<[f32; 3]> = (start..total.min(start + VERTICES_AT_ONCE)).map(position).collect();
-                let mut inputs = Vec::with_capacity(points.len() * columns);
-                for point in &points {
-                    inputs.extend(point.map(scaled));
-                    inputs.extend(std::iter::repeat_n(0.0, columns - 3));
-                }
-                let mut raw = vec![0.0; points.len() * regions * 2];
-                let mut values = vec![0.0; points.len() * 2];
-                for (region, shape) in field.shape.iter().enumerate() {
-                    shape.forward(&inputs, &mut values)?;
-                    for (point, values) in values.chunks_exact(2).enumerate() {
-                        raw[(point * regions + region) * 2..][..2].copy_from_slice(values);
-                    }
-                }
-                let mut distances = Vec::with_capacity(points.len());
-                let mut masks = [0f32; REGION_COUNT];
-                for (point, raw) in points.iter().zip(raw.chunks_exact(regions * 2)) {
-                    let fused = field.fuse(raw, &mut masks[..regions]);
-                    distances.push(field.distance(*point, fused.residual, 0.0));
-                }
-                Ok(Vertices { distances, raw })
-            })
-            .collect();
-        let mut all = Vertices::default();
-        for block in blocks {
-            let block = block?;
-            all.distances.extend(block.distances);
-            all.raw.extend(block.raw);
-        }
-        Ok(all)
+        (0..self.estimates.len()).map(is_near).collect()
     }
 
-    fn estimate(&self, field: &Ready, negligible: f32) -> Vec<CellEstimate> {
+    /// The cell's place along each axis.
+    fn index(&self, cell: usize) -> [usize; 3] {
+        let [columns, rows, _] = self.cells;
+        [cell % columns, cell / columns % rows, cell / (columns * rows)]
+    }
+
+    /// The cell of a grid [`FINENESS`] times coarser that holds the cell at `index`.
+    fn parent(&self, index: [usize; 3]) -> usize {
+        let [columns, rows, _] = self.cells.map(|cells| cells / FINENESS);
+        let [column, row, layer] = index.map(|index| index / FINENESS);
+        (layer * rows + row) * columns + column
+    }
+
+    /// The world point of a vertex.
+    fn position(&self, vertex: usize) -> [f32; 3] {
+        let [columns, rows, _] = self.cells.map(|cells| cells + 1);
+        let index = [vertex % columns, vertex / columns % rows, vertex / (columns * rows)];
+        std::array::from_fn(|axis| self.low[axis] + self.cell * index[axis] as f32)
+    }
+
+    /// Values at the vertices: evaluated everywhere, or where cells of a coarser grid are near, and else interpolated
+    /// in that.
+    fn fill(&mut self, field: &Ready, coarser: Option<(&Self, &[bool])>) -> Result<()> {
+        let total = self.distances.len();
+        let mut wanted = vec![coarser.is_none(); total];
+        if let Some((coarse, near)) = coarser {
+            for (cell, _) in near.iter().enumerate().filter(|(_, near)| **near) {
+                let [column, row, layer] = coarse.index(cell).map(|index| index * FINENESS);
+                for up in 0..=FINENESS {
+                    for along in 0..=FINENESS {
+                        let first = self.vertex([column, row + along, layer + up]);
+                        wanted[first..=first + FINENESS].fill(true);
+                    }
+                }
+            }
+        }
         let regions = self.regions;
+        let evaluated: Vec<usize> = (0..total).filter(|vertex| wanted[*vertex]).collect();
+        self.evaluated = evaluated.len();
+        let blocks: Vec<Vertices> = evaluated
+            .par_chunks(VERTICES_AT_ONCE)
+            .map(|vertices| self.evaluate(field, vertices))
+            .collect::<Result<_>>()?;
+        for (vertices, block) in evaluated.chunks(VERTICES_AT_ONCE).zip(blocks) {
+            let values = block.distances.iter().zip(block.raw.chunks_exact(regions * 2));
+            for (vertex, (distance, raw)) in vertices.iter().zip(values) {
+                self.distances[*vertex] = *distance;
+                self.raw[vertex * regions * 2..][..regions * 2].copy_from_slice(raw);
+            }
+        }
+        if let Some((coarse, _)) = coarser {
+            let positions: Vec<[f32; 3]> = (0..total).map(|vertex| self.position(vertex)).collect();
+            let values = self.distances.par_iter_mut().zip(self.raw.par_chunks_exact_mut(regions * 2));
+            values.zip(positions).zip(wanted).filter(|(_, wanted)| !wanted).for_each(
+                |(((distance, raw), point), _)| {
+                    if let Some(place) = coarse.place(point) {
+                        *distance = coarse.distance(place);
+                        coarse.raw(place, u16::MAX, raw);
+                    }
+                },
+            );
+        }
+        Ok(())
+    }
+
+    fn evaluate(&self, field: &Ready, vertices: &[usize]) -> Result<Vertices> {
+        let (columns, regions) = (field.columns(), self.regions);
+        let points: Vec<[f32; 3]> = vertices.iter().map(|vertex| self.position(*vertex)).collect();
+        let mut inputs = Vec::with_capacity(points.len() * columns);
+        for point in &points {
+            inputs.extend(point.map(scaled));
+            inputs.extend(std::iter::repeat_n(0.0, columns - 3));
+        }
+        let mut raw = vec![0.0; points.len() * regions * 2];
+        let mut values = vec![0.0; points.len() * 2];
+        for (region, shape) in field.shape.iter().enumerate() {
+            shape.forward(&inputs, &mut values)?;
+            for (point, values) in values.chunks_exact(2).enumerate() {
+                raw[(point * regions + region) * 2..][..2].copy_from_slice(values);
+            }
+        }
+        let mut distances = Vec::with_capacity(points.len());
+        let mut masks = [0f32; REGION_COUNT];
+        for (point, raw) in points.iter().zip(raw.chunks_exact(regions * 2)) {
+            let fused = field.fuse(raw, &mut masks[..regions]);
+            distances.push(field.distance(*point, fused.residual, 0.0));
+        }
+        Ok(Vertices { distances, raw })
+    }
+
+    /// Estimates of the cells; those in cells of a coarser grid that are not near are its.
+    fn estimate(&self, field: &Ready, negligible: f32, coarser: Option<(&Self, &[bool])>) -> Vec<CellEstimate> {
+        let coarse_of = |cell: usize| {
+            let (coarse, near) = coarser?;
+            let parent = self.parent(self.index(cell));
+            if near[parent] { None } else { coarse.estimates.get(parent).copied() }
+        };
+        let mut wanted = vec![false; self.distances.len()];
+        let own: Vec<Option<CellEstimate>> = (0..self.cells.iter().product::<usize>()).map(coarse_of).collect();
+        for (cell, _) in own.iter().enumerate().filter(|(_, estimate)| estimate.is_none()) {
+            let place = Place { cell, vertex: self.vertex(self.index(cell)), fraction: [0.5; 3] };
+            self.corners(place).for_each(|(vertex, _)| wanted[vertex] = true);
+        }
+        let estimated = |(vertex, wanted)| {
+            if wanted { self.estimate_vertex(field, vertex) } else { VertexEstimate::default() }
+        };
+        let vertices: Vec<VertexEstimate> = wanted.into_par_iter().enumerate().map(estimated).collect();
         let optional = matches!(field.local.fusion, Fusion::Softmax { .. }) && field.local.residual == Residual::Gated;
-        let every = ((1u32 << regions) - 1) as u16;
-        let vertices: Vec<VertexEstimate> =
-            (0..self.distances.len()).into_par_iter().map(|vertex| self.estimate_vertex(field, vertex)).collect();
-        let counts = self.cells;
-        (0..counts.iter().product::<usize>())
-            .into_par_iter()
-            .map(|cell| {
-                let index = [cell % counts[0], cell / counts[0] % counts[1], cell / (counts[0] * counts[1])];
-                let place = Place { cell, vertex: self.vertex(index), fraction: [0.5; 3] };
-                let mut estimate = CellEstimate { relevant: every, ..CellEstimate::default() };
-                let mut largest = [0f32; REGION_COUNT];
-                for (vertex, _) in self.corners(place) {
-                    let corner = &vertices[vertex];
-                    estimate.distance = estimate.distance.max(SAFETY * corner.distance);
-                    estimate.masks = estimate.masks.max(SAFETY * corner.colour).min(1.0);
-                    for (largest, region) in largest.iter_mut().zip(corner.regions) {
-                        *largest = largest.max(SAFETY * region);
-                    }
-                }
-                let mut order: Vec<usize> = if optional { (0..regions).collect() } else { Vec::new() };
-                order.sort_by(|left, right| largest[*left].total_cmp(&largest[*right]));
-                for region in order {
-                    if estimate.left_out + largest[region] > negligible {
-                        break;
-                    }
-                    estimate.left_out += largest[region];
-                    estimate.relevant &= !(1 << region);
-                }
-                estimate
+        own.into_par_iter()
+            .enumerate()
+            .map(|(cell, estimate)| {
+                let place = Place { cell, vertex: self.vertex(self.index(cell)), fraction: [0.5; 3] };
+                let estimate = estimate.unwrap_or_else(|| self.estimate_cell(place, &vertices, optional, negligible));
+                let nearest = self.furthest(place, |distance, nearest| distance < nearest);
+                CellEstimate { nearest: nearest - estimate.distance, ..estimate }
             })
             .collect()
+    }
+
+    fn estimate_cell(
+        &self,
+        place: Place,
+        vertices: &[VertexEstimate],
+        optional: bool,
+        negligible: f32,
+    ) -> CellEstimate {
+        let regions = self.regions;
+        let every = ((1u32 << regions) - 1) as u16;
+        let mut estimate = CellEstimate { relevant: every, ..CellEstimate::default() };
+        let mut largest = [0f32; REGION_COUNT];
+        for (vertex, _) in self.corners(place) {
+            let corner = &vertices[vertex];
+            estimate.distance = estimate.distance.max(SAFETY * corner.distance);
+            estimate.masks = estimate.masks.max(SAFETY * corner.colour).min(1.0);
+            for (largest, region) in largest.iter_mut().zip(corner.regions) {
+                *largest = largest.max(SAFETY * region);
+            }
+        }
+        let mut order: Vec<usize> = if optional { (0..regions).collect() } else { Vec::new() };
+        order.sort_by(|left, right| largest[*left].total_cmp(&largest[*right]));
+        for region in order {
+            if estimate.left_out + largest[region] > negligible {
+                break;
+            }
+            estimate.left_out += largest[region];
+            estimate.relevant &= !(1 << region);
+        }
+        estimate
     }
 
     fn estimate_vertex(&self, field: &Ready, vertex: usize) -> VertexEstimate {
@@ -403,7 +518,7 @@ mod tests {
             let [logit, distance] = median_radii(&field, 0.3 / cells);
             println!("{cells} cells a side: mask logits ± {logit:.3}, Δd ± {distance:.5}");
         }
-        let [_, distance] = median_radii(&field, 0.3 / CELLS as f64);
+        let [_, distance] = median_radii(&field, 0.3 / (COARSE_CELLS * FINENESS) as f64);
         // Light falls by e within α: a distance known to no better than that says nothing of where the light is.
         assert!(distance * f64::from(field.inverse_alpha) > 1.0, "{distance}: use proven bounds after all");
         // The form itself is sound and, for tiny cells, tight: it shrinks with the cell.

@@ -1,10 +1,12 @@
 //! A field as plain numbers: what a plan reads instead of tensors, and the arithmetic that fuses regions at a point.
 
+use candle_core::{Device, Tensor};
+
 use crate::{
     camera::INPUT_SCALE,
     config::{DensityKind, Fusion, Residual},
     error::Result,
-    kernels::{self, HeadShape, Outputs, PreparedRegion},
+    kernels::{self, HeadShape, Linear, Outputs, PreparedRegion},
     region::{REGION_COUNT, Region, RegionSet},
 };
 
@@ -33,6 +35,21 @@ pub enum LocalInitial {
     Network(LocalWeights),
 }
 
+/// The linear map from activations to features; all portraits'.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocalFeatures {
+    /// F.
+    pub count: usize,
+    /// W, or W + 3 with the view direction.
+    pub columns: usize,
+    /// `[9, F, columns]`.
+    pub weight: Vec<f32>,
+    /// `[9, F]`.
+    pub bias: Vec<f32>,
+    /// Whether the last three columns are the view direction's.
+    pub sees_view: bool,
+}
+
 /// One portrait's field, see [`super::super::RadianceField::local`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct LocalField {
@@ -54,6 +71,8 @@ pub struct LocalField {
     pub density: DensityKind,
     /// 1 / α, 1 / world units.
     pub inverse_alpha: f32,
+    /// What features are made of.
+    pub features: LocalFeatures,
 }
 
 impl LocalWeights {
@@ -71,16 +90,20 @@ impl LocalWeights {
     /// What `index`'s colour logits can be, whatever the point and the view: the last layer's activations are sines,
     /// so a logit is within its bias ± the sum of its weights' magnitudes; view directions are of unit length.
     fn logit_range(&self, index: usize) -> LogitRange {
-        let colour = self.shape.layout().colour;
-        let (weights, _) = self.region(index);
-        let rows = weights[colour.weight.clone()].chunks_exact(colour.inputs);
         let mut range = LogitRange { middle: [0.0; 3], radius: [0.0; 3] };
-        for (channel, (row, bias)) in rows.zip(&weights[colour.bias.clone()]).enumerate() {
-            range.middle[channel] = *bias;
-            // The sum's own rounding, and sines that round to just above 1.
-            range.radius[channel] = row.iter().map(|weight| weight.abs()).sum::<f32>() * 1.000_01;
+        for (channel, (middle, radius)) in self.ranges(index, &self.shape.layout().colour).enumerate() {
+            (range.middle[channel], range.radius[channel]) = (middle, radius);
         }
         range
+    }
+
+    /// middle and radius of each output of a head of `index`.
+    fn ranges(&self, index: usize, head: &Linear) -> impl Iterator<Item = (f32, f32)> {
+        let (weights, _) = self.region(index);
+        let rows = weights[head.weight.clone()].chunks_exact(head.inputs);
+        // The sum's own rounding, and sines that round to just above 1.
+        let radius = |row: &[f32]| row.iter().map(|weight| weight.abs()).sum::<f32>() * 1.000_01;
+        rows.zip(&weights[head.bias.clone()]).map(move |(row, bias)| (*bias, radius(row)))
     }
 }
 
@@ -99,6 +122,99 @@ impl LogitRange {
 
     pub fn largest_radius(&self) -> f32 {
         self.radius.iter().fold(0.0, |largest, radius| largest.max(*radius))
+    }
+}
+
+/// How far the surface can lie from the sphere that it starts as. Heads read sines, so a residual is no less than its
+/// bias minus the sum of its weights' magnitudes, and a mask's logit no more than its bias plus that sum, whatever the
+/// point. Under softmax Σ m_i Δd_i is a mean of the Δd_i: what is known of some of them, and these limits of the others,
+/// limit it from below.
+#[derive(Clone, Debug)]
+pub struct Reach {
+    /// The sphere's, world units.
+    radius: f32,
+    /// Regions, those first that can pull the surface furthest out.
+    pub order: Vec<usize>,
+    /// In that order: the least Δd of this region and all behind it, world units.
+    least: Vec<f32>,
+    /// In that order: the largest Σ exp(logit) over this region and all behind it.
+    largest: Vec<f32>,
+    /// What raw masks are multiplied by.
+    sharpness: f32,
+    /// World units per unit of a raw residual.
+    scale: f32,
+}
+
+/// A point as its regions become known in the order of a [`Reach`].
+#[derive(Clone, Copy, Debug)]
+pub struct PartlyKnown {
+    /// Distance to the sphere, world units.
+    initial: f32,
+    /// Σ exp(logit) of the known regions.
+    weight: f32,
+    /// Σ exp(logit) Δd of the known regions.
+    moment: f32,
+}
+
+impl Reach {
+    /// What rounding may add to a distance, world units: a thousandth of any α that a surface is rendered with.
+    const ROUNDING: f32 = 1e-6;
+
+    /// Of the fields that have one: gated residuals around a sphere, masks that share 1.
+    fn new(local: &LocalField, regions: usize) -> Option<Self> {
+        let (Fusion::Softmax { sharpness }, Residual::Gated, DensityKind::ResidualSdf, LocalInitial::Sphere { radius }) =
+            (local.fusion, local.residual, local.density, &local.initial)
+        else {
+            return None;
+        };
+        let (layout, scale) = (local.generators.shape.layout(), local.residual_scale as f32);
+        let limits: Vec<(f32, f32)> = (0..regions)
+            .filter_map(|region| {
+                let (residual, residual_radius) = local.generators.ranges(region, &layout.residual).next()?;
+                let (mask, mask_radius) = local.generators.ranges(region, &layout.mask).next()?;
+                let logit = mask * sharpness as f32 + mask_radius * sharpness.abs() as f32;
+                Some((residual * scale - residual_radius * scale.abs() - Self::ROUNDING, logit.exp() * 1.000_1))
+            })
+            .collect();
+        let mut order: Vec<usize> = (0..limits.len()).collect();
+        order.sort_by(|left, right| limits[*left].0.total_cmp(&limits[*right].0));
+        let (mut least, mut largest) = (vec![0.0; order.len()], vec![0.0; order.len()]);
+        let (mut lowest, mut sum) = (f32::INFINITY, 0.0);
+        for (place, region) in order.iter().enumerate().rev() {
+            let (residual, weight) = limits[*region];
+            // Not `min`: NaN must spread, so that nothing is proven by it.
+            lowest = if residual > lowest { lowest } else { residual };
+            sum += weight;
+            (least[place], largest[place]) = (lowest, sum);
+        }
+        Some(Self { radius: *radius as f32, order, least, largest, sharpness: sharpness as f32, scale })
+    }
+
+    /// A world point of which no region is known.
+    pub fn start(&self, point: [f32; 3]) -> PartlyKnown {
+        PartlyKnown { initial: length(point) - self.radius, weight: 0.0, moment: 0.0 }
+    }
+
+    /// The least signed distance, world units, where the regions before `place` of the order are known. NaN if any of
+    /// it is.
+    pub fn least_distance(&self, known: &PartlyKnown, place: usize) -> f32 {
+        let (least, largest) = (self.least[place], self.largest[place]);
+        let mean = if place == 0 {
+            least
+        } else {
+            let mean = known.moment / known.weight;
+            // The others pull the mean down the further the more they weigh, but not below what is known if they cannot
+            // lie below it.
+            if least >= mean { mean } else { (known.moment + largest * least) / (known.weight + largest) }
+        };
+        known.initial + mean - Self::ROUNDING
+    }
+
+    /// One more region is known by its raw mask and residual.
+    pub fn learn(&self, known: &mut PartlyKnown, raw: &[f32]) {
+        let weight = (raw[0] * self.sharpness).exp();
+        known.weight += weight;
+        known.moment += weight * raw[1] * self.scale;
     }
 }
 
@@ -121,6 +237,63 @@ pub struct Ready {
     pub initial: Option<Box<dyn PreparedRegion<f32>>>,
     pub ranges: Vec<LogitRange>,
     pub background_range: Option<LogitRange>,
+    pub reach: Option<Reach>,
+    /// Features of activations, where they are shown.
+    pub features: Option<Features>,
+}
+
+/// What makes features of activations, see [`LocalFeatures`].
+pub struct Features {
+    /// Per region, `[W, F]`.
+    weights: Vec<Tensor>,
+    local: LocalFeatures,
+}
+
+impl Features {
+    fn new(local: &LocalFeatures, width: usize) -> Result<Self> {
+        let weight = Tensor::from_slice(&local.weight, (REGION_COUNT, local.count, local.columns), &Device::Cpu)?;
+        let weight = weight.narrow(2, 0, width)?.transpose(1, 2)?;
+        let weights = (0..REGION_COUNT).map(|region| Ok(weight.get(region)?.contiguous()?)).collect::<Result<_>>()?;
+        Ok(Self { weights, local: local.clone() })
+    }
+
+    /// F.
+    pub fn count(&self) -> usize {
+        self.local.count
+    }
+
+    /// Adds what a region's activations `[n, W]`, those of `rays`, make of the rays' features `[R, F]`.
+    pub fn add(&self, region: Region, rays: &[u32], activations: Vec<f32>, features: &mut [f32]) -> Result<()> {
+        let (Some(weight), false) = (self.weights.get(region.index()), rays.is_empty()) else { return Ok(()) };
+        let rows = Tensor::from_vec(activations, (rays.len(), weight.dim(0)?), &Device::Cpu)?.matmul(weight)?;
+        let rows = rows.flatten_all()?.to_vec1::<f32>()?;
+        for (ray, row) in rays.iter().zip(rows.chunks_exact(self.count())) {
+            add_scaled(&mut features[*ray as usize * self.count()..][..self.count()], 1.0, row);
+        }
+        Ok(())
+    }
+
+    /// Adds what does not depend on activations: what a ray's masks `[9]` and the direction it is seen from add.
+    pub fn add_constant(&self, masks: &[f32], view: [f32; 3], features: &mut [f32]) {
+        let LocalFeatures { count, columns, weight, bias, sees_view } = &self.local;
+        for (region, mask) in masks.iter().enumerate().filter(|(_, mask)| **mask != 0.0) {
+            add_scaled(features, *mask, &bias[region * count..][..*count]);
+            if *sees_view {
+                let rows = weight[region * count * columns..].chunks_exact(*columns);
+                for (feature, row) in features.iter_mut().zip(rows) {
+                    let seen = row[columns - 3..].iter().zip(view).map(|(weight, view)| weight * view);
+                    *feature += mask * seen.sum::<f32>();
+                }
+            }
+        }
+    }
+}
+
+/// sum += scale · terms.
+pub fn add_scaled(sum: &mut [f32], scale: f32, terms: &[f32]) {
+    for (sum, term) in sum.iter_mut().zip(terms) {
+        *sum += scale * term;
+    }
 }
 
 impl Ready {
@@ -141,6 +314,12 @@ impl Ready {
             },
             ranges: (0..regions.len()).map(|index| local.generators.logit_range(index)).collect(),
             background_range: local.background.as_ref().map(|weights| weights.logit_range(0)),
+            reach: Reach::new(&local, regions.len()),
+            features: if outputs.activations {
+                Some(Features::new(&local.features, local.generators.shape.width)?)
+            } else {
+                None
+            },
             regions,
             local,
         })
@@ -214,6 +393,17 @@ impl Ready {
         }
         let inverse = self.local.inverse_alpha;
         sigmoid(-distance * inverse) * inverse
+    }
+
+    /// From which signed distance on, world units, density is at most `density`, 1 / world units; infinity if that is not
+    /// known.
+    pub fn distance_of(&self, density: f32) -> f32 {
+        if self.local.density == DensityKind::Density {
+            return f32::INFINITY;
+        }
+        let alpha = 1.0 / self.local.inverse_alpha;
+        // Density never exceeds 1 / α.
+        (1.0 / (alpha * density) - 1.0).max(f32::MIN_POSITIVE).ln() * alpha
     }
 
     /// What multiplies a region's ∇raw mask in ∇d, given its mask, its Δd (world units) and Σ m_j Δd_j: see the

@@ -1,11 +1,12 @@
 //! From the shape branches to how much of a pixel each sample makes up, front to back: a ray ends where what is left of
-//! its light cannot matter.
+//! its light cannot matter, and space that is proven empty is passed by.
 
 use crate::{
     error::Result,
     region::REGION_COUNT,
     render::plan::{
-        local::Ready,
+        CUT_SHARE, EMPTY_SHARE,
+        local::{PartlyKnown, Reach, Ready},
         rays::Rays,
         state::{ChunkState, Room},
     },
@@ -30,8 +31,9 @@ pub struct Marched {
     pub marched: Vec<u32>,
     /// Light that was left where the ray was ended early, `[n]`: it counts as the last marched sample's.
     pub cut: Vec<f32>,
-    /// What geometry that was not evaluated is estimated to change, [0, 1] colour units, `[n]`.
-    pub estimated: Vec<f32>,
+    /// What geometry that was not evaluated may change, [0, 1] colour units, `[n]`: proven in plans, estimated over shared
+    /// geometry.
+    pub unevaluated: Vec<f32>,
     /// (sample, region) pairs whose shape branch ran.
     pub shape_pairs: usize,
     /// Samples where any did.
@@ -60,27 +62,78 @@ impl Light {
     }
 }
 
-/// Marches rays, ending each where its transmittance falls to `cut` or below; 0 never ends one.
-pub fn march(field: &Ready, rays: &Rays, cut: f32, state: &mut ChunkState, room: &mut Room) -> Result<Marched> {
+/// What marching may leave out of a pixel.
+#[derive(Clone, Copy)]
+pub struct Allowance {
+    /// Light at which a ray ends.
+    cut: f32,
+    /// Optical depth that a sample may have and still count as empty.
+    empty: f32,
+}
+
+impl Allowance {
+    /// No ray ends early, every sample counts.
+    pub const NOTHING: Self = Self { cut: 0.0, empty: 0.0 };
+
+    /// The shares of `budget` that are marching's, for rays of `samples` samples.
+    pub fn of(budget: f64, samples: usize) -> Self {
+        let empty = budget * EMPTY_SHARE / samples.max(1) as f64;
+        Self { cut: (budget * CUT_SHARE) as f32, empty: empty as f32 }
+    }
+}
+
+/// Marches rays, ending each where its transmittance falls to what is allowed or below.
+///
+/// A sample counts as empty if its optical depth τ is proven small ([`Reach`]): with T the light that arrives there,
+/// leaving it out moves the pixel from (1 - e^-τ) T c + e^-τ T c' to T c', where c and c', its own colour and what
+/// lies behind, are in [0, 1]: by no more than T τ.
+pub fn march(
+    field: &Ready,
+    rays: &Rays,
+    allowance: Allowance,
+    state: &mut ChunkState,
+    room: &mut Room,
+) -> Result<Marched> {
     let (count, samples, regions) = (rays.count(), rays.samples, field.regions.len());
     let mut marched = Marched::new(rays, regions);
     let every = ((1u32 << regions) - 1) as u16;
+    let reach = field.reach.as_ref().filter(|_| allowance.empty > 0.0);
+    let empty_from = field.distance_of(allowance.empty / rays.longest());
+    let cut = allowance.cut;
     let mut light = vec![Light::default(); count];
     let mut active: Vec<u32> = (0..count as u32).collect();
     let mut at: Vec<u32> = Vec::with_capacity(count);
+    // Proven distances of the step's empty samples; others are evaluated.
+    let mut empty: Vec<Option<f32>> = vec![None; count];
     for step in 0..samples {
         at.clear();
         at.extend(active.iter().map(|ray| ray * samples as u32 + step as u32));
-        marched.samples_evaluated += at.iter().filter(|sample| !state.known[**sample as usize] & every != 0).count();
-        marched.shape_pairs += state.fill_shapes(field, rays, &at, |_| every, room)?;
+        let takes_all = rays.closed && step + 1 == samples;
+        marched.samples_evaluated += match reach.filter(|_| !takes_all) {
+            Some(reach) => {
+                let mut proof = Proof { reach, empty_from, empty: &mut empty, open: Vec::new() };
+                proof.run(field, rays, &at, state, &mut marched, room)?
+            }
+            None => {
+                let unknown = at.iter().filter(|sample| !state.known[**sample as usize] & every != 0).count();
+                marched.shape_pairs += state.fill_shapes(field, rays, &at, |_| every, room)?;
+                unknown
+            }
+        };
         active.retain(|ray| {
             let ray = *ray as usize;
             let sample = ray * samples + step;
+            marched.marched[ray] = step as u32 + 1;
+            if let Some(distance) = empty[ray].take() {
+                let optical = field.density(distance) * rays.lengths[sample];
+                marched.distances[sample] = distance;
+                marched.unevaluated[ray] += light[ray].left() * optical;
+                marched.remaining[ray] = light[ray].left();
+                return true;
+            }
             marched.fuse(field, rays, state, sample);
             let density = field.density(marched.distances[sample]);
-            let takes_all = rays.closed && step + 1 == samples;
             marched.weights[sample] = light[ray].pass(density, rays.lengths[sample], takes_all);
-            marched.marched[ray] = step as u32 + 1;
             let left = if takes_all { 0.0 } else { light[ray].left() };
             marched.remaining[ray] = left;
             if left <= cut && cut > 0.0 && step + 1 < samples {
@@ -97,6 +150,58 @@ pub fn march(field: &Ready, rays: &Rays, cut: f32, state: &mut ChunkState, room:
     Ok(marched)
 }
 
+/// Shape branches of one step, region after region, until each sample's are known or it is proven empty.
+struct Proof<'a> {
+    reach: &'a Reach,
+    /// Signed distance from which on a sample counts as empty, world units.
+    empty_from: f32,
+    /// Per ray.
+    empty: &'a mut [Option<f32>],
+    /// Samples of which nothing is proven yet.
+    open: Vec<(u32, PartlyKnown)>,
+}
+
+impl Proof<'_> {
+    /// Returns the number of samples where any shape branch ran.
+    fn run(
+        &mut self,
+        field: &Ready,
+        rays: &Rays,
+        samples: &[u32],
+        state: &mut ChunkState,
+        marched: &mut Marched,
+        room: &mut Room,
+    ) -> Result<usize> {
+        let regions = field.regions.len();
+        self.open.extend(samples.iter().map(|sample| (*sample, self.reach.start(rays.point(*sample as usize)))));
+        let mut evaluated = 0;
+        let mut wanted = Vec::with_capacity(samples.len());
+        for (place, region) in self.reach.order.iter().enumerate() {
+            let (reach, empty_from, empty) = (self.reach, self.empty_from, &mut *self.empty);
+            wanted.clear();
+            self.open.retain(|(sample, known)| {
+                let least = reach.least_distance(known, place);
+                let is_empty = least >= empty_from;
+                if is_empty {
+                    empty[*sample as usize / rays.samples] = Some(least);
+                } else {
+                    wanted.push(*sample);
+                }
+                !is_empty
+            });
+            let pairs = state.fill_shape(field, rays, &wanted, *region, room)?;
+            // Whatever is known of a sample, the first region is known first.
+            evaluated += if place == 0 { pairs } else { 0 };
+            marched.shape_pairs += pairs;
+            for (sample, known) in &mut self.open {
+                let raw = &state.raw[(*sample as usize * regions + region) * 2..][..2];
+                self.reach.learn(known, raw);
+            }
+        }
+        Ok(evaluated)
+    }
+}
+
 impl Marched {
     /// Nothing marched yet.
     pub fn new(rays: &Rays, regions: usize) -> Self {
@@ -109,7 +214,7 @@ impl Marched {
             remaining: vec![0.0; count],
             marched: vec![0; count],
             cut: vec![0.0; count],
-            estimated: vec![0.0; count],
+            unevaluated: vec![0.0; count],
             shape_pairs: 0,
             samples_evaluated: 0,
         }
@@ -117,7 +222,7 @@ impl Marched {
 
     /// What a ray's marching spent of its pixel's budget.
     pub fn spent(&self, ray: usize) -> f32 {
-        self.cut[ray] + self.estimated[ray]
+        self.cut[ray] + self.unevaluated[ray]
     }
 
     /// Masks, mean and distance of a sample whose raw values are known.

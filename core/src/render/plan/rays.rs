@@ -61,6 +61,11 @@ impl Rays {
         self.directions.len()
     }
 
+    /// The largest length that a sample stands for, world units.
+    pub fn longest(&self) -> f32 {
+        self.lengths.iter().fold(0.0, |longest, length| longest.max(*length))
+    }
+
     /// Some of them.
     pub fn part(&self, rays: std::ops::Range<usize>) -> Self {
         let samples = rays.start * self.samples..rays.end * self.samples;

@@ -26,6 +26,8 @@ use crate::{
 const INTERPOLATION_SHARE: f64 = 0.25;
 /// The share that regions left out of cells may spend.
 const REGION_SHARE: f64 = 0.125;
+/// The share of [`INTERPOLATION_SHARE`] that light from space taken for empty may spend.
+const EMPTY_SHARE: f64 = 0.05;
 
 /// Views of one portrait that share a coarse grid of its geometry.
 ///
@@ -61,7 +63,10 @@ impl Sequence {
             Some(local) if is_shareable(&local) && !is_exhaustive(settings) => {
                 let ready = Ready::new(local, Shown::new(settings).outputs())?;
                 let (low, high) = extent(cameras, settings)?;
-                let grid = Grid::new(&ready, low, high, (settings.budget * REGION_SHARE) as f32)?;
+                let interval = settings.sampling.interval() as f32;
+                let empty_from =
+                    ready.distance_of(Allowance::of(settings.budget, settings.sampling.samples).empty / interval);
+                let grid = Grid::new(&ready, low, high, (settings.budget * REGION_SHARE) as f32, empty_from)?;
                 Some(Shared { ready, grid })
             }
             _ => None,
@@ -103,7 +108,7 @@ impl Sequence {
                 for ((rays, chunk), range) in chunks.iter().zip(wave) {
                     let chunk_report = chunk.report(&shared.ready, rays, self.settings.budget);
                     report = report.and(FrameReport { method: Method::Shared, ..chunk_report });
-                    parts.push(field, &view, image, *range, &chunk.pixels)?;
+                    parts.push(&view, image, *range, &chunk.pixels)?;
                 }
             }
         }
@@ -133,6 +138,38 @@ fn extent(cameras: &Tensor, settings: &RenderSettings) -> Result<([f32; 3], [f32
     Ok((low, high))
 }
 
+/// What marching a ray over the grid may leave out of its pixel.
+struct Allowance {
+    /// Light at which a ray ends.
+    cut: f32,
+    /// What interpolating a sample may change.
+    interpolated: f32,
+    /// Optical depth that a sample may have and still count as empty.
+    empty: f32,
+}
+
+impl Allowance {
+    fn of(budget: f64, samples: usize) -> Self {
+        let interpolated = budget * INTERPOLATION_SHARE / samples.max(1) as f64;
+        Self {
+            cut: (budget * CUT_SHARE) as f32,
+            interpolated: interpolated as f32,
+            empty: (interpolated * EMPTY_SHARE) as f32,
+        }
+    }
+}
+
+/// How a sample becomes known.
+#[derive(Clone, Copy)]
+enum Look {
+    /// Not at all: no light comes from there, or none gets there.
+    Empty,
+    /// From the grid.
+    Interpolated(Place),
+    /// By the regions that matter there, or by all outside of the grid.
+    Exact(Option<Place>),
+}
+
 impl Shared {
     fn chunk(&self, rays: Rays, shown: Shown, settings: &RenderSettings) -> Result<(Rays, Chunk)> {
         let mut room = Room::default();
@@ -153,93 +190,58 @@ impl Shared {
     /// Marches rays at their own depths.
     fn march(&self, rays: &Rays, budget: f64, state: &mut ChunkState, room: &mut Room) -> Result<Marched> {
         let samples = rays.samples;
+        let allowance = Allowance::of(budget, samples);
         let mut marched = Marched::new(rays, self.ready.regions.len());
-        let cut = (budget * CUT_SHARE) as f32;
-        // What each sample may spend of its pixel.
-        let spendable = (budget * INTERPOLATION_SHARE) as f32 / samples as f32;
-        // Light that may come from nowhere without a closer look: a thousandth of that.
-        let empty = spendable * 1e-3;
-        let (mut exact, mut wanted) = (Vec::new(), Vec::new());
-        let mut places = vec![None; rays.depths.len()];
-        let mut interpolated = vec![false; rays.depths.len()];
-        for ray in 0..rays.count() {
-            let (mut light, mut brightest) = (Light::default(), Light::default());
-            for step in 0..samples {
-                let sample = ray * samples + step;
-                let takes_all = rays.closed && step + 1 == samples;
-                marched.marched[ray] = step as u32 + 1;
-                let Some(place) = self.grid.place(rays.point(sample)) else {
-                    exact.push(sample as u32);
-                    wanted.push(u16::MAX);
-                    continue;
-                };
-                places[sample] = Some(place);
-                let estimate = self.grid.estimate_at(place);
-                let distance = self.grid.distance(place);
-                marched.distances[sample] = distance;
-                // Far from the surface, where nearly all samples are, the rest would compute zeros.
-                let dark = self.ready.density(distance - estimate.distance) * rays.lengths[sample];
-                if dark <= empty {
-                    interpolated[sample] = true;
-                    marched.estimated[ray] += dark;
-                    continue;
-                }
-                let arriving = brightest.left();
-                let optical = |distance: f32| self.ready.density(distance) * rays.lengths[sample];
-                let bright = optical(distance + estimate.distance);
-                let weight = light.pass(self.ready.density(distance), rays.lengths[sample], takes_all);
-                brightest.pass(self.ready.density(distance + estimate.distance), rays.lengths[sample], takes_all);
-                let impact = arriving * ((-bright).exp() - (-dark).exp()) + weight * estimate.masks;
-                // Not `impact > spendable`: NaN must be looked at.
-                if impact <= spendable {
-                    interpolated[sample] = true;
-                    marched.estimated[ray] += impact;
-                } else {
-                    exact.push(sample as u32);
-                    wanted.push(estimate.relevant);
-                }
-                if brightest.left() <= cut {
-                    break;
-                }
-            }
-        }
-        marched.samples_evaluated = exact.len();
-        marched.shape_pairs = state.fill_shapes(&self.ready, rays, &exact, |place| wanted[place], room)?;
-        for (sample, wanted) in exact.iter().zip(&wanted) {
-            self.interpolate(places[*sample as usize], !wanted, *sample as usize, state);
-        }
+        let looks = self.look(rays, &allowance, &mut marched);
+        let wanted_at = |look: &Look| match look {
+            Look::Exact(place) => Some(place.map_or(u16::MAX, |place| self.grid.estimate_at(place).relevant)),
+            _ => None,
+        };
+        let exact = looks.iter().enumerate().filter_map(|(sample, look)| Some((sample as u32, wanted_at(look)?)));
+        let (list, wanted): (Vec<u32>, Vec<u16>) = exact.unzip();
+        marched.samples_evaluated = list.len();
+        marched.shape_pairs = state.fill_shapes(&self.ready, rays, &list, |place| wanted[place], room)?;
         for ray in 0..rays.count() {
             let mut light = Light::default();
             let reached = marched.marched[ray] as usize;
             for step in 0..reached {
                 let sample = ray * samples + step;
                 let takes_all = rays.closed && step + 1 == samples;
-                if interpolated[sample] {
-                    let weight =
-                        light.pass(self.ready.density(marched.distances[sample]), rays.lengths[sample], takes_all);
-                    marched.weights[sample] = weight;
-                    if weight <= empty {
-                        marched.estimated[ray] += weight;
-                    } else {
-                        self.interpolate(places[sample], u16::MAX, sample, state);
-                        marched.fuse(&self.ready, rays, state, sample);
+                match looks[sample] {
+                    Look::Empty => continue,
+                    Look::Interpolated(place) => {
+                        let density = self.ready.density(marched.distances[sample]);
+                        let weight = light.pass(density, rays.lengths[sample], takes_all);
+                        marched.weights[sample] = weight;
+                        if weight <= allowance.empty {
+                            marched.unevaluated[ray] += weight;
+                        } else {
+                            self.interpolate(place, u16::MAX, sample, state);
+                            marched.fuse(&self.ready, rays, state, sample);
+                        }
                     }
-                } else {
-                    marched.fuse(&self.ready, rays, state, sample);
-                    let density = self.ready.density(marched.distances[sample]);
-                    marched.weights[sample] = light.pass(density, rays.lengths[sample], takes_all);
-                    let left_out = places[sample].map_or(0.0, |place| self.grid.estimate_at(place).left_out);
-                    marched.estimated[ray] += marched.weights[sample] * left_out;
+                    Look::Exact(place) => {
+                        let mut left_out = 0.0;
+                        if let Some(place) = place {
+                            let estimate = self.grid.estimate_at(place);
+                            self.interpolate(place, !estimate.relevant, sample, state);
+                            left_out = estimate.left_out;
+                        }
+                        marched.fuse(&self.ready, rays, state, sample);
+                        let density = self.ready.density(marched.distances[sample]);
+                        marched.weights[sample] = light.pass(density, rays.lengths[sample], takes_all);
+                        marched.unevaluated[ray] += marched.weights[sample] * left_out;
+                    }
                 }
                 let left = if takes_all { 0.0 } else { light.left() };
                 marched.remaining[ray] = left;
-                if left <= cut && step + 1 < reached {
+                if left <= allowance.cut && step + 1 < reached {
                     marched.marched[ray] = step as u32 + 1;
                     break;
                 }
             }
             let end = marched.marched[ray] as usize;
-            if end < samples || marched.remaining[ray] <= cut {
+            if end < samples || marched.remaining[ray] <= allowance.cut {
                 let left = std::mem::take(&mut marched.remaining[ray]);
                 marched.weights[ray * samples + end - 1] += left;
                 marched.cut[ray] = left;
@@ -248,12 +250,61 @@ impl Shared {
         Ok(marched)
     }
 
-    /// Puts interpolated raw values of the regions `wanted` (bits) in the place of evaluated ones.
-    fn interpolate(&self, place: Option<Place>, wanted: u16, sample: usize, state: &mut ChunkState) {
-        let values = 2 * self.ready.regions.len();
-        if let Some(place) = place {
-            self.grid.raw(place, wanted, &mut state.raw[sample * values..][..values]);
+    /// How each sample is to become known; sets distances, and how far rays are marched.
+    fn look(&self, rays: &Rays, allowance: &Allowance, marched: &mut Marched) -> Vec<Look> {
+        let samples = rays.samples;
+        let empty_from = self.ready.distance_of(allowance.empty / rays.longest());
+        let mut looks = vec![Look::Empty; rays.depths.len()];
+        for ray in 0..rays.count() {
+            let (mut light, mut brightest) = (Light::default(), Light::default());
+            marched.remaining[ray] = 1.0;
+            for step in 0..samples {
+                let sample = ray * samples + step;
+                let takes_all = rays.closed && step + 1 == samples;
+                marched.marched[ray] = step as u32 + 1;
+                let Some(place) = self.grid.place(rays.point(sample)) else {
+                    looks[sample] = Look::Exact(None);
+                    continue;
+                };
+                let estimate = self.grid.estimate_at(place);
+                if estimate.nearest >= empty_from && !takes_all {
+                    marched.unevaluated[ray] += allowance.empty;
+                    continue;
+                }
+                let distance = self.grid.distance(place);
+                marched.distances[sample] = distance;
+                // Far from the surface, where nearly all samples are, the rest would compute zeros.
+                let dark = self.ready.density(distance - estimate.distance) * rays.lengths[sample];
+                if dark <= allowance.empty && !takes_all {
+                    looks[sample] = Look::Interpolated(place);
+                    marched.unevaluated[ray] += dark;
+                    continue;
+                }
+                let arriving = brightest.left();
+                let bright = self.ready.density(distance + estimate.distance);
+                let weight = light.pass(self.ready.density(distance), rays.lengths[sample], takes_all);
+                brightest.pass(bright, rays.lengths[sample], takes_all);
+                let bright = bright * rays.lengths[sample];
+                let impact = arriving * ((-bright).exp() - (-dark).exp()) + weight * estimate.masks;
+                // Not `impact > allowed`: NaN must be looked at.
+                if impact <= allowance.interpolated {
+                    looks[sample] = Look::Interpolated(place);
+                    marched.unevaluated[ray] += impact;
+                } else {
+                    looks[sample] = Look::Exact(Some(place));
+                }
+                if brightest.left() <= allowance.cut {
+                    break;
+                }
+            }
         }
+        looks
+    }
+
+    /// Puts interpolated raw values of the regions `wanted` (bits) in the place of evaluated ones.
+    fn interpolate(&self, place: Place, wanted: u16, sample: usize, state: &mut ChunkState) {
+        let values = 2 * self.ready.regions.len();
+        self.grid.raw(place, wanted, &mut state.raw[sample * values..][..values]);
     }
 
     /// Rays whose samples lie where the grid says the light comes from, each with the same share of it.
@@ -269,14 +320,22 @@ impl Shared {
         let mut depths = Vec::with_capacity(rays.count() * samples);
         let mut remaining = Vec::with_capacity(rays.count());
         let mut light_of_bins = vec![0f64; bins];
+        let allowance = Allowance::of(settings.budget, bins);
         for direction in &rays.directions {
             let unit = length(*direction);
+            let empty_from = self.ready.distance_of(allowance.empty / (fine.interval() as f32 * unit));
             let mut light = Light::default();
             for (bin, weight) in light_of_bins.iter_mut().enumerate() {
                 let depth = (fine.near + fine.interval() * (bin as f64 + 0.5)) as f32;
                 let point = std::array::from_fn(|axis| direction[axis] * depth + rays.origin[axis]);
-                let distance = self.grid.place(point).map_or(f32::INFINITY, |place| self.grid.distance(place));
                 let takes_all = rays.closed && bin + 1 == bins;
+                let place = self.grid.place(point);
+                let is_empty = place.is_none_or(|place| self.grid.estimate_at(place).nearest >= empty_from);
+                if is_empty && !takes_all {
+                    *weight = 0.0;
+                    continue;
+                }
+                let distance = place.map_or(f32::INFINITY, |place| self.grid.distance(place));
                 let passed = light.pass(self.ready.density(distance), fine.interval() as f32 * unit, takes_all);
                 *weight = f64::from(passed);
             }
@@ -295,7 +354,7 @@ impl Shared {
             marched.marched[ray] = samples as u32;
             // A pixel without light needs no sample.
             if share * samples as f32 <= (settings.budget * CUT_SHARE) as f32 {
-                marched.estimated[ray] = share * samples as f32;
+                marched.unevaluated[ray] = share * samples as f32;
                 continue;
             }
             for sample in ray * samples..(ray + 1) * samples {
@@ -309,7 +368,9 @@ impl Shared {
         marched.shape_pairs = state.fill_shapes(&self.ready, &rays, &lit, |place| wanted[place], room)?;
         for (sample, wanted) in lit.into_iter().zip(wanted) {
             let sample = sample as usize;
-            self.interpolate(self.grid.place(rays.point(sample)), !wanted, sample, &mut state);
+            if let Some(place) = self.grid.place(rays.point(sample)) {
+                self.interpolate(place, !wanted, sample, &mut state);
+            }
             marched.fuse(&self.ready, &rays, &state, sample);
         }
         Ok((rays, state, marched))

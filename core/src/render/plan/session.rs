@@ -89,7 +89,7 @@ impl Session {
                 for (result, range) in chunks.into_iter().zip(wave) {
                     let (rays, chunk) = result?;
                     report = report.and(chunk.report(&ready, &rays, budget));
-                    parts.push(field, view, image, *range, &chunk.pixels)?;
+                    parts.push(view, image, *range, &chunk.pixels)?;
                 }
             }
         }

@@ -7,7 +7,7 @@ use crate::{
     region::{REGION_COUNT, Region},
     render::plan::{
         Shown,
-        local::{LocalInitial, Ready, length, scaled, sigmoid},
+        local::{Features, LocalInitial, Ready, add_scaled, length, scaled, sigmoid},
         march::Marched,
         rays::Rays,
         select::Selection,
@@ -28,8 +28,8 @@ const TRACE: f32 = 1e-9;
 pub struct Pixels {
     /// `[n, 3]` in [0, 1].
     pub colour: Vec<f32>,
-    /// Activations weighted and summed along rays, `[n, 9, W]`; empty if nobody asked.
-    pub activations: Vec<f32>,
+    /// `[n, F]`; empty if nobody asked.
+    pub features: Vec<f32>,
     /// `[n, 9]`.
     pub masks: Vec<f32>,
     /// Along the view axis, world units, `[n]`.
@@ -47,7 +47,7 @@ impl Pixels {
     pub fn append(&mut self, more: Self) {
         let columns = [
             (&mut self.colour, more.colour),
-            (&mut self.activations, more.activations),
+            (&mut self.features, more.features),
             (&mut self.masks, more.masks),
             (&mut self.depth, more.depth),
             (&mut self.normal, more.normal),
@@ -70,10 +70,11 @@ pub fn shade(
     state: &mut ChunkState,
     room: &mut Room,
 ) -> Result<Pixels> {
-    let (count, regions, width) = (rays.count(), field.regions.len(), field.local.generators.shape.width);
+    let (count, regions) = (rays.count(), field.regions.len());
+    let feature_count = field.features.as_ref().map_or(0, Features::count);
     let mut pixels = Pixels {
         colour: vec![0.0; count * 3],
-        activations: vec![0.0; if shown.features { count * REGION_COUNT * width } else { 0 }],
+        features: vec![0.0; count * feature_count],
         masks: vec![0.0; count * REGION_COUNT],
         depth: vec![0.0; count],
         normal: vec![0.0; if shown.normals { count * 3 } else { 0 }],
@@ -85,8 +86,8 @@ pub fn shade(
         let (samples, prepared) = (&selection.samples[region], field.heads[region].as_ref());
         pixels.pairs += state.heads[region].fill(prepared, rays, samples, &mut room.inputs)?;
         let rows = prepared.rows();
-        let region_row = field.regions[region].index();
         let visible = shown.regions.contains(field.regions[region]);
+        let mut sums = RaySums::default();
         for sample in samples {
             let values = state.heads[region].at(*sample, rows.count);
             let sample = *sample as usize;
@@ -96,13 +97,15 @@ pub fn shade(
                 add_scaled(&mut logits[sample], mask, &values[colour.clone()]);
             }
             if let Some(activations) = rows.activations.as_ref().filter(|_| visible) {
-                let sum = &mut pixels.activations[(ray * REGION_COUNT + region_row) * width..][..width];
-                add_scaled(sum, weight * mask, &values[activations.clone()]);
+                sums.add(ray as u32, weight * mask, &values[activations.clone()]);
             }
             if shown.normals {
                 let share = NormalShare { mask, mean: marched.means[sample], weight };
                 share.add(field, &rows, values, &mut pixels.normal[ray * 3..][..3]);
             }
+        }
+        if let Some(features) = &field.features {
+            features.add(field.regions[region], &sums.rays, sums.activations, &mut pixels.features)?;
         }
     }
     let doubts = Doubts::new(field, shown);
@@ -144,6 +147,10 @@ pub fn shade(
             });
             add_scaled(&mut colour, remaining, &unseen);
         }
+        if let Some(features) = &field.features {
+            let row = &mut pixels.features[ray * feature_count..][..feature_count];
+            features.add_constant(&masks, rays.views[ray], row);
+        }
         pixels.masks[ray * REGION_COUNT..][..REGION_COUNT].copy_from_slice(&masks);
         pixels.colour[ray * 3..][..3].copy_from_slice(&colour);
     }
@@ -164,7 +171,8 @@ fn shade_background(
     room: &mut Room,
 ) -> Result<()> {
     let (Some(background), Some(range)) = (&field.background, field.background_range) else { return Ok(()) };
-    let (rows, width, columns) = (background.rows(), background.shape().width, background.shape().point_columns());
+    let (rows, columns) = (background.rows(), background.shape().point_columns());
+    let mut sums = RaySums::default();
     room.inputs.clear();
     for ray in selected {
         let (ray, far) = (*ray as usize, camera::FAR as f32);
@@ -182,10 +190,12 @@ fn shade_background(
                 pixels.colour[ray * 3 + channel] += remaining * (sigmoid(*logit) - unseen);
             }
         }
-        if let Some(activations) = rows.activations.as_ref().filter(|_| !pixels.activations.is_empty()) {
-            let row = ray * REGION_COUNT + Region::Background.index();
-            add_scaled(&mut pixels.activations[row * width..][..width], remaining, &values[activations.clone()]);
+        if let Some(activations) = &rows.activations {
+            sums.add(ray as u32, remaining, &values[activations.clone()]);
         }
+    }
+    if let Some(features) = &field.features {
+        features.add(Region::Background, &sums.rays, sums.activations, &mut pixels.features)?;
     }
     pixels.pairs += selected.len();
     Ok(())
@@ -294,8 +304,22 @@ fn middle(centre: f32, radius: f32) -> f32 {
     if radius <= UNCERTAIN { sigmoid(centre) } else { 0.5 * (sigmoid(centre - radius) + sigmoid(centre + radius)) }
 }
 
-fn add_scaled(sum: &mut [f32], scale: f32, terms: &[f32]) {
-    for (sum, term) in sum.iter_mut().zip(terms) {
-        *sum += scale * term;
+/// One region's activations, weighted and summed along those rays that have any: most rays see one region or two.
+#[derive(Default)]
+struct RaySums {
+    rays: Vec<u32>,
+    /// `[n, W]`.
+    activations: Vec<f32>,
+}
+
+impl RaySums {
+    /// Adds a sample's; samples come ray by ray.
+    fn add(&mut self, ray: u32, scale: f32, activations: &[f32]) {
+        if self.rays.last() != Some(&ray) {
+            self.rays.push(ray);
+            self.activations.resize(self.rays.len() * activations.len(), 0.0);
+        }
+        let start = (self.rays.len() - 1) * activations.len();
+        add_scaled(&mut self.activations[start..], scale, activations);
     }
 }

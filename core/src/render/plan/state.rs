@@ -137,26 +137,10 @@ impl ChunkState {
         wanted: impl Fn(usize) -> u16,
         room: &mut Room,
     ) -> Result<usize> {
-        let regions = field.regions.len();
-        let columns = field.columns();
         let mut pairs = 0;
-        for region in 0..regions {
-            let bit = 1u16 << region;
-            room.start();
-            for (place, sample) in samples.iter().enumerate() {
-                if wanted(place) & !self.known[*sample as usize] & bit != 0 {
-                    room.samples.push(*sample);
-                    rays.push_input(*sample as usize, columns, &mut room.inputs);
-                }
-            }
-            pairs += room.samples.len();
-            room.values.resize(2 * room.samples.len(), 0.0);
-            field.shape[region].forward(&room.inputs, &mut room.values)?;
-            for (sample, values) in room.samples.iter().zip(room.values.chunks_exact(2)) {
-                let sample = *sample as usize;
-                self.raw[(sample * regions + region) * 2..][..2].copy_from_slice(values);
-                self.known[sample] |= bit;
-            }
+        for region in 0..field.regions.len() {
+            let places = samples.iter().enumerate().filter(|(place, _)| wanted(*place) & 1 << region != 0);
+            pairs += self.fill_one(field, rays, places.map(|(_, sample)| *sample), region, room)?;
         }
         if let Some(initial) = &field.initial {
             room.start();
@@ -173,6 +157,42 @@ impl ChunkState {
             }
         }
         Ok(pairs)
+    }
+
+    /// Runs one region's shape branch at those of `samples` where it is not known yet; returns how many that were.
+    pub fn fill_shape(
+        &mut self,
+        field: &Ready,
+        rays: &Rays,
+        samples: &[u32],
+        region: usize,
+        room: &mut Room,
+    ) -> Result<usize> {
+        self.fill_one(field, rays, samples.iter().copied(), region, room)
+    }
+
+    fn fill_one(
+        &mut self,
+        field: &Ready,
+        rays: &Rays,
+        samples: impl Iterator<Item = u32>,
+        region: usize,
+        room: &mut Room,
+    ) -> Result<usize> {
+        let (regions, columns, bit) = (field.regions.len(), field.columns(), 1u16 << region);
+        room.start();
+        for sample in samples.filter(|sample| self.known[*sample as usize] & bit == 0) {
+            room.samples.push(sample);
+            rays.push_input(sample as usize, columns, &mut room.inputs);
+        }
+        room.values.resize(2 * room.samples.len(), 0.0);
+        field.shape[region].forward(&room.inputs, &mut room.values)?;
+        for (sample, values) in room.samples.iter().zip(room.values.chunks_exact(2)) {
+            let sample = *sample as usize;
+            self.raw[(sample * regions + region) * 2..][..2].copy_from_slice(values);
+            self.known[sample] |= bit;
+        }
+        Ok(room.samples.len())
     }
 }
 

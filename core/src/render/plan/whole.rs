@@ -9,7 +9,7 @@ use crate::{
     render::plan::{
         Shown,
         local::Ready,
-        march,
+        march::{self, Allowance},
         rays::Rays,
         select::Selection,
         shade::{self, Pixels},
@@ -35,7 +35,7 @@ pub fn render(field: &Ready, rays: &Rays, shown: &Shown) -> Result<Pixels> {
         }
         let samples: Vec<u32> = (0..part.depths.len() as u32).collect();
         state.fill_heads(field, &part, &samples, &mut room)?;
-        let marched = march::march(field, &part, 0.0, &mut state, &mut room)?;
+        let marched = march::march(field, &part, Allowance::NOTHING, &mut state, &mut room)?;
         let everything = Selection::of_everything(field, &part, shown, samples);
         pixels.append(shade::shade(field, &part, &marched, &everything, shown, &mut state, &mut room)?);
     }
