@@ -14,6 +14,7 @@ mod render;
 mod shell;
 mod synth;
 mod train;
+mod train_parser;
 
 use clap::{Parser, Subcommand};
 
@@ -41,6 +42,8 @@ enum Command {
     Dataset(dataset::DatasetCommand),
     /// Train a model
     Train(Box<train::TrainArguments>),
+    /// Train the network that finds regions and head pose in photos
+    TrainParser(train_parser::TrainParserArguments),
     /// Make random portraits
     Generate(generate::GenerateArguments),
     /// Turn photos into editable 3D portraits
@@ -74,6 +77,7 @@ pub fn run(arguments: Arguments, console: &Console) -> anyhow::Result<Outcome> {
         Command::Synth(synth) => synth.run(seed.unwrap_or(0), console),
         Command::Dataset(dataset) => dataset.run(console),
         Command::Train(train) => train.run(seed, console),
+        Command::TrainParser(train) => train.run(seed.unwrap_or(0), console),
         Command::Generate(generate) => generate.run(console),
         Command::Invert(invert) => invert.run(seed.unwrap_or(0), console),
         Command::Edit(edit) => edit.run(seed, console),

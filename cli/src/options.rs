@@ -6,6 +6,7 @@ use anyhow::{Context as _, bail};
 use candle_core::Device;
 use clap::Args;
 use cnerf_core::model::generator::Generator;
+use cnerf_invert::start::NearStart;
 
 /// Options every command takes.
 #[derive(Args, Clone, Debug)]
@@ -76,6 +77,12 @@ impl ModelSource {
             None if path.exists() => Ok(Generator::open(path, &device)?),
             None => bail!("{name}: no such file, and no built-in model ({})", cnerf_models::NAMES.join(", ")),
         }
+    }
+
+    /// The near start of the built-in model asked for, or of `default`; other models have none.
+    pub fn near_start(&self, default: &str) -> anyhow::Result<Option<NearStart>> {
+        let name = self.model.as_deref().unwrap_or(default);
+        Ok(cnerf_models::start(name).map(|bytes| NearStart::from_bytes(Path::new(name), bytes)).transpose()?)
     }
 
     /// The device asked for.

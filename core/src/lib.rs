@@ -3,7 +3,7 @@
 //!
 //! A floor uses only floors below it:
 //! vocabulary ([`region`], [`camera`], [`codes`], [`config`], [`parameters`], [`rng`], [`files`], [`error`]) →
-//! [`kernels`] → [`render`] → [`model`] → [`data`] / [`train`] → [`eval`] / [`interop`] → [`bench`].
+//! [`kernels`] → [`render`] → [`model`] → [`data`] / [`train`] / [`parsing`] → [`eval`] / [`interop`] → [`bench`].
 
 pub mod bench;
 pub mod camera;
@@ -16,6 +16,7 @@ pub mod files;
 pub mod interop;
 pub mod model;
 pub mod parameters;
+pub mod parsing;
 pub mod region;
 pub mod render;
 pub mod rng;

@@ -6,12 +6,16 @@
 
 mod regressor;
 
-use cnerf_core::camera::Camera;
+use cnerf_core::{camera::Camera, data::labels::LabelMap};
 use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
 pub use self::regressor::{FEATURES, POSE_OUTPUTS, Regressor, STEP_OUTPUTS, features};
-use crate::{detect::Face, error::Result};
+use crate::{
+    detect::Face,
+    error::Result,
+    parser::{Parsed, RegionParser},
+};
 
 /// A square cut from a photo, turned about its centre.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -111,6 +115,17 @@ pub struct Aligned {
     pub camera: Camera,
     /// Share of the crop beyond the photo's edges, mirrored, in [0, 1].
     pub padded: f64,
+}
+
+impl Aligned {
+    /// The regions `parser` finds in the crop of `photo`. If it reads the head's pose too, that becomes the first camera.
+    pub fn parse(&mut self, photo: &RgbImage, parser: &dyn RegionParser) -> Result<LabelMap> {
+        let Parsed { labels, camera } = parser.parse(&self.transform.cut(photo, parser.side()))?;
+        if let Some(camera) = camera {
+            self.camera = camera;
+        }
+        Ok(labels)
+    }
 }
 
 /// Aligns one face of a photo and cuts it at `size` x `size` pixels.

@@ -1,6 +1,8 @@
 //! How well photos are inverted: held-out people, none of whose regions, camera or other views the inverter is told
 //! unless asked, measured against what the data set knows of them.
 
+pub mod parsing;
+
 use std::{
     path::{Path, PathBuf},
     time::Instant,
@@ -33,7 +35,9 @@ use crate::{
     error::{Error, Result},
     events::Event,
     inverter::{Inverter, Opened},
+    parser::RegionParser,
     photo::{PhotoOptions, Subject},
+    start::NearStart,
 };
 
 /// The first element of every stream drawn here.
@@ -93,6 +97,17 @@ pub struct EvaluationOptions {
     pub known_pose: bool,
     /// Give the data set's region masks.
     pub known_masks: bool,
+}
+
+/// What people are inverted with beside the model.
+#[derive(Clone, Copy, Default)]
+pub struct Helpers<'a> {
+    /// Adds a perceptual loss and the LPIPS metric.
+    pub perceptual: Option<&'a Perceptual>,
+    /// Finds regions and head pose, unless the inverter is told them.
+    pub parser: Option<&'a dyn RegionParser>,
+    /// Finds first codes.
+    pub near: Option<&'a NearStart>,
 }
 
 /// Who is inverted: the people of a data set, each with all views there are, or the photos of a folder.
@@ -189,12 +204,19 @@ impl People {
     }
 
     /// Reads one person at `side` x `side` pixels.
-    fn read(&self, index: usize, side: u32, options: &EvaluationOptions) -> Result<Person> {
+    fn read(
+        &self,
+        index: usize,
+        side: u32,
+        Helpers { parser, near, .. }: Helpers<'_>,
+        options: &EvaluationOptions,
+    ) -> Result<Person> {
         let name = self.name(index);
         let (dataset, items) = match &self.source {
             Source::Photos(photos) => {
                 let path = photos.get(index).ok_or_else(|| Error::config("--count", "beyond the photos there are"))?;
-                let subject = Subject::read(path, &PhotoOptions::default(), None, side)?;
+                let mut subject = Subject::read(path, &PhotoOptions::default(), parser, side)?;
+                near.map_or(Ok(()), |near| subject.start_near(near))?;
                 return Ok(Person { name, subject, camera: None, labels: None, depth: None, others: Vec::new() });
             }
             Source::Dataset { dataset, people } => {
@@ -205,16 +227,24 @@ impl People {
         let Item { image, mask, camera } = dataset.item(*first)?;
         let labels = mask.map(|mask| mask.resized(side, side)).transpose()?;
         let mut aligned = align::already_aligned(&image, side)?;
+        let parsed = parser.map(|parser| aligned.parse(&image, parser)).transpose()?;
         if options.known_pose {
             aligned.camera = camera
                 .ok_or_else(|| Error::config("--known-pose", format!("{name}: the data set names no camera for it")))?;
         }
-        let known = if options.known_masks { labels.clone() } else { None };
-        if options.known_masks && known.is_none() {
+        let regions = if options.known_masks { labels.clone() } else { parsed };
+        if options.known_masks && regions.is_none() {
             return Err(Error::config("--known-masks", format!("{name}: the data set has no mask of it")));
         }
-        let subject =
-            Subject { source: name.clone(), aligned, labels: known, parser_seconds: None, warnings: Vec::new() };
+        let mut subject = Subject {
+            source: name.clone(),
+            aligned,
+            labels: regions,
+            start: None,
+            parser_seconds: None,
+            warnings: Vec::new(),
+        };
+        near.map_or(Ok(()), |near| subject.start_near(near))?;
         let other = |index: &usize| -> Result<Option<OtherView>> {
             let Item { image, mask, camera } = dataset.item(*index)?;
             let Some(camera) = camera else { return Ok(None) };
@@ -297,7 +327,7 @@ pub struct NovelView {
     pub foreground_psnr: Option<f64>,
 }
 
-/// Inverts one of `people` and measures the result. `step` is called after every optimiser step with those done and
+/// Inverts one of `people` with the help of `helpers` and measures the result. `step` is called after every optimiser step with those done and
 /// those there are in all.
 ///
 /// Other views are rendered from the found camera turned by as much as the true cameras are apart: an error of the
@@ -306,13 +336,13 @@ pub fn invert_one(
     generator: &Generator,
     people: &People,
     index: usize,
-    perceptual: Option<&Perceptual>,
+    helpers: Helpers<'_>,
     options: &EvaluationOptions,
     step: &mut dyn FnMut(usize, usize),
 ) -> Result<InversionScore> {
     let began = Instant::now();
     let side = generator.output_resolution() as u32;
-    let person = people.read(index, side, options)?;
+    let person = people.read(index, side, helpers, options)?;
     let read_seconds = began.elapsed().as_secs_f64();
     let photo = person.subject.aligned.picture.clone();
     let mut config = options.variant.apply(options.config.clone());
@@ -320,7 +350,8 @@ pub fn invert_one(
     let steps = config.steps();
     // What was read of other views is no part of inverting a photo, but as nothing beside the optimisation.
     let started = Instant::now();
-    let mut inverter = Inverter::new(generator, &options.model_name, person.subject.clone(), config, perceptual)?;
+    let mut inverter =
+        Inverter::new(generator, &options.model_name, person.subject.clone(), config, helpers.perceptual)?;
     let (mut done, mut curve) = (0, Vec::new());
     while let Some(event) = inverter.step()? {
         if let Event::Pivot(report) | Event::Tune(report) = event {
@@ -513,7 +544,8 @@ mod tests {
         let config = InvertConfig { pivot_steps: Some(3), tune_steps: Some(1), ..InvertConfig::default() };
         let options = EvaluationOptions { config, known_pose: true, known_masks: true, ..EvaluationOptions::default() };
         let mut steps = Vec::new();
-        let score = invert_one(&generator, &people, 0, None, &options, &mut |done, all| steps.push((done, all)));
+        let score =
+            invert_one(&generator, &people, 0, Helpers::default(), &options, &mut |done, all| steps.push((done, all)));
         let score = score.unwrap();
         assert_eq!(steps, [(1, 4), (2, 4), (3, 4), (4, 4)]);
         assert_eq!((score.novel_views.len(), score.curve.len()), (2, 4));
@@ -523,7 +555,7 @@ mod tests {
         assert!(score.depth_correlation.is_some_and(|found| (-1.0..=1.0).contains(&found)), "{score:?}");
         let pivot = EvaluationOptions { variant: Variant::Pivot, ..options };
         let mut count = 0;
-        let again = invert_one(&generator, &people, 0, None, &pivot, &mut |_, _| count += 1).unwrap();
+        let again = invert_one(&generator, &people, 0, Helpers::default(), &pivot, &mut |_, _| count += 1).unwrap();
         assert_eq!((count, again.depth_drift), (3, 0.0));
 
         let summary = InversionSummary::of(&[score.clone(), again.clone()], 1);

@@ -113,7 +113,9 @@ impl<'a> Inverter<'a> {
             |subject: &Subject| Target::new(&subject.aligned.picture, subject.labels.as_ref(), generator, perceptual);
         let targets = subjects.iter().map(target).collect::<Result<_>>()?;
         let cameras: Vec<Camera> = subjects.iter().map(|subject| subject.aligned.camera).collect();
-        let pivot = Pivot::new(generator, &cameras, &config)?;
+        let starts: Vec<&Tensor> = subjects.iter().filter_map(|subject| subject.start.as_ref()).collect();
+        let start = if starts.is_empty() { None } else { Some(Tensor::cat(&starts, 0)?.mean_keepdim(0)?) };
+        let pivot = Pivot::new(generator, &cameras, start.as_ref(), &config)?;
         let pending =
             subjects.iter().flat_map(|subject| subject.warnings.iter().cloned().map(Event::Warning)).collect();
         let model = ModelName { name: model_name.to_owned(), hash: generator.hash()? };
@@ -180,6 +182,7 @@ impl<'a> Inverter<'a> {
             let camera = Camera::parameter_tensor(&[subject.aligned.camera], &Device::Cpu)?;
             all.insert(format!("camera{index}"), camera.to_dtype(DType::F32)?);
             all.insert(format!("photo{index}"), target.output.colour.clone());
+            all.extend(subject.start.iter().map(|start| (format!("start{index}"), start.clone())));
             all.extend(target.output.masks.iter().map(|masks| (format!("masks{index}"), masks.clone())));
         }
         Ok(file::hash(&all)?)
@@ -395,7 +398,7 @@ pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, perceptual
     let steps = config.steps();
     // A pivot of two steps takes them on rays, with as many rays as the effort has.
     let short = InvertConfig { pivot_steps: Some(2), ..config.clone() };
-    let mut pivot = Pivot::new(generator, &[Camera::default()], &short)?;
+    let mut pivot = Pivot::new(generator, &[Camera::default()], None, &short)?;
     let prepared = began.elapsed();
     let on_rays = warm_seconds(|| pivot.step(generator, std::slice::from_ref(&target)).map(drop))?;
     let view = Camera::parameter_tensor(&[Camera::default()], &generator.device())?;

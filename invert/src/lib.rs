@@ -18,6 +18,7 @@ pub mod photo;
 pub mod pivot;
 pub mod portrait;
 pub mod space;
+pub mod start;
 pub mod tune;
 
 pub use error::{Error, Result};

@@ -2,7 +2,14 @@
 
 use std::path::PathBuf;
 
-use cnerf_core::data::labels::{LabelMap, LabelScheme};
+use cnerf_core::{
+    camera::Camera,
+    data::{
+        labels::{LabelMap, LabelScheme},
+        picture,
+    },
+    parsing::{self, FaceParser},
+};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
@@ -21,8 +28,29 @@ pub trait RegionParser {
     /// Width and height at which the parser sees best, pixels; portraits are cut at that size for it.
     fn side(&self) -> u32;
 
-    /// The region of every pixel of `portrait`, which is square. The map is square too, of any size.
-    fn parse(&self, portrait: &RgbImage) -> Result<LabelMap>;
+    /// Reads `portrait`, which is square.
+    fn parse(&self, portrait: &RgbImage) -> Result<Parsed>;
+}
+
+/// What a parser saw in a portrait.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Parsed {
+    /// The region of every pixel: a square map of any size.
+    pub labels: LabelMap,
+    /// The camera that the head's pose suggests (azimuth, elevation and roll), if the parser reads it.
+    pub camera: Option<Camera>,
+}
+
+/// The suite's own.
+impl RegionParser for FaceParser {
+    fn side(&self) -> u32 {
+        parsing::SIDE as u32
+    }
+
+    fn parse(&self, portrait: &RgbImage) -> Result<Parsed> {
+        let face = FaceParser::parse(self, portrait)?;
+        Ok(Parsed { labels: face.labels, camera: Some(face.camera) })
+    }
 }
 
 /// The classes of the face parsers trained on CelebAMask-HQ that most exporters publish (zllrunning's BiSeNet and its
@@ -80,13 +108,19 @@ impl PixelScale {
     }
 }
 
+/// The word that stands for no parser in place of a file.
+const NO_PARSER: &str = "none";
+/// Largest parser of our own kind that is read, bytes.
+const LARGEST_PARSER: u64 = 64 << 20;
+
 /// A face parser's file, and what the file itself does not say.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 #[serde(default, deny_unknown_fields)]
 pub struct ParserConfig {
-    /// Face parser in ONNX format that finds the regions of each photo
-    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE.onnx", conflicts_with = "mask"))]
+    /// Face parser that finds the regions of each photo, in ONNX format or of `train-parser`; `none` finds none
+    /// [default: the built-in one]
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE|none"))]
     pub parser: Option<PathBuf>,
     /// The parser's classes in the order of its labels [default: background skin l_brow r_brow l_eye r_eye glasses
     /// l_ear r_ear earring nose mouth u_lip l_lip neck necklace cloth hair hat]
@@ -110,9 +144,21 @@ impl ParserConfig {
         })
     }
 
-    /// The parser named, loaded; none if none is named.
-    pub fn load(&self) -> Result<Option<Box<dyn RegionParser>>> {
-        let Some(path) = &self.parser else { return Ok(None) };
+    /// The parser named, loaded; `built_in` (the bytes of a parser's file) if none is named.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is no face parser.
+    pub fn load(&self, built_in: &[u8]) -> Result<Option<Box<dyn RegionParser>>> {
+        let Some(path) = &self.parser else {
+            return Ok(Some(Box::new(FaceParser::from_bytes("the built-in parser".as_ref(), built_in)?)));
+        };
+        if path.as_os_str() == NO_PARSER {
+            return Ok(None);
+        }
+        if path.extension().is_some_and(|extension| extension == "safetensors") {
+            let bytes = picture::read_file(path, LARGEST_PARSER)?;
+            return Ok(Some(Box::new(FaceParser::from_bytes(path, &bytes)?)));
+        }
         #[cfg(feature = "onnx")]
         return Ok(Some(Box::new(OnnxParser::load(path, self.scheme()?, self.parser_input)?)));
         #[cfg(not(feature = "onnx"))]

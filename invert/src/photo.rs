@@ -5,6 +5,7 @@ use std::{
     time::Instant,
 };
 
+use candle_core::Tensor;
 use cnerf_core::{
     camera::Camera,
     data::{
@@ -21,6 +22,7 @@ use crate::{
     detect,
     error::{Error, Result},
     parser::RegionParser,
+    start::NearStart,
 };
 
 /// Photos with fewer pixels on a side cannot hold a usable face.
@@ -52,6 +54,8 @@ pub struct Subject {
     pub aligned: Aligned,
     /// Region of every pixel of the crop, if known, at a size of its own.
     pub labels: Option<LabelMap>,
+    /// The noise `[1, D]` of a portrait that looks like this one, if a [`NearStart`] was asked.
+    pub start: Option<Tensor>,
     /// How long the parser took, seconds, if it was asked.
     pub parser_seconds: Option<f64>,
     /// What the user should know, e.g. that there were several faces.
@@ -84,21 +88,23 @@ impl Subject {
             let percent = 100.0 * aligned.padded;
             warnings.push(format!("{}: {percent:.0} % of the crop lies beyond the photo, mirrored", path.display()));
         }
+        let began = Instant::now();
+        let parsed = parser.map(|parser| aligned.parse(&photo, parser)).transpose()?;
+        let parser_seconds = parsed.as_ref().map(|_| began.elapsed().as_secs_f64());
         if let Some([azimuth, elevation]) = options.pose {
             aligned.camera = Camera { roll_rad: aligned.camera.roll_rad, ..Camera::at(azimuth, elevation) };
         }
-        let mut parser_seconds = None;
-        let labels = match (&options.mask, parser) {
-            (Some(mask), _) => Some(read_labels(mask, &photo, &aligned.transform, size)?),
-            (None, Some(parser)) => {
-                let began = Instant::now();
-                let labels = parser.parse(&aligned.transform.cut(&photo, parser.side()))?;
-                parser_seconds = Some(began.elapsed().as_secs_f64());
-                Some(labels)
-            }
-            (None, None) => None,
+        let labels = match &options.mask {
+            Some(mask) => Some(read_labels(mask, &photo, &aligned.transform, size)?),
+            None => parsed,
         };
-        Ok(Self { source: path.display().to_string(), aligned, labels, parser_seconds, warnings })
+        Ok(Self { source: path.display().to_string(), aligned, labels, start: None, parser_seconds, warnings })
+    }
+
+    /// Asks `near` for a start; it has none for a portrait whose regions are unknown.
+    pub fn start_near(&mut self, near: &NearStart) -> Result<()> {
+        self.start = self.labels.as_ref().map(|labels| near.noise(&self.aligned.picture, labels)).transpose()?;
+        Ok(())
     }
 }
 

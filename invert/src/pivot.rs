@@ -32,6 +32,8 @@ use crate::{
 const STREAM: u64 = 0x7069_766f;
 /// What the render under a whole picture counts beside the picture itself.
 const RENDER_SHARE: f64 = 0.5;
+/// Whitened codes further out than this lie where the model has no portraits; a start is not trusted beyond.
+const MOST_UNUSUAL: f64 = 3.0;
 const BETAS: Betas = Betas { first: 0.9, second: 0.99 };
 /// Rates fall over the second half of each phase.
 const SCHEDULE: Schedule = Schedule { warmup_steps: 5, hold: 0.5, floor: 0.1 };
@@ -57,10 +59,23 @@ pub struct Pivot {
 }
 
 impl Pivot {
-    /// Starts at the model's mean portrait, seen by one of `cameras` in each photo.
-    pub fn new(generator: &Generator, cameras: &[Camera], config: &InvertConfig) -> Result<Self> {
+    /// Starts at the portrait of the noise `start` `[1, D]`, else at the model's mean portrait, seen by one of `cameras`
+    /// in each photo.
+    pub fn new(
+        generator: &Generator,
+        cameras: &[Camera],
+        start: Option<&Tensor>,
+        config: &InvertConfig,
+    ) -> Result<Self> {
         let space = CodeSpace::measure(generator)?;
         let device = generator.device();
+        let shared = match start {
+            Some(noise) => {
+                let codes = generator.map(&noise.to_device(&device)?)?;
+                space.whitened(&codes)?.clamp(-MOST_UNUSUAL, MOST_UNUSUAL)?.detach()
+            }
+            None => Tensor::zeros((1, space.style_dim()), candle_core::DType::F32, &device)?,
+        };
         let zeros = |rows: usize| Var::zeros((rows, space.style_dim()), candle_core::DType::F32, &device);
         let global = matches!(&generator.config().upsampler, Some(u) if u.style == UpsamplerStyle::Global);
         let first_cameras = cameras
@@ -71,7 +86,7 @@ impl Pivot {
             config: config.pivot.clone(),
             steps: config.steps(),
             seed: config.seed,
-            shared: zeros(1)?,
+            shared: Var::from_tensor(&shared)?,
             rows: zeros(2 * REGION_COUNT)?,
             global: if global { Some(zeros(1)?) } else { None },
             cameras: first_cameras.iter().map(Var::from_tensor).collect::<candle_core::Result<_>>()?,

@@ -18,6 +18,8 @@ pub struct CodeSpace {
     mean: Tensor,
     /// Lᵀ, `[D, D]`.
     spread: Tensor,
+    /// L⁻ᵀ, `[D, D]`.
+    inverse: Tensor,
 }
 
 impl CodeSpace {
@@ -31,10 +33,12 @@ impl CodeSpace {
         let rows: Vec<Vec<f64>> = covariance.to_dtype(DType::F64)?.to_vec2()?;
         let length = rows.len();
         let lower = cholesky(rows);
-        let transposed: Vec<f32> =
-            (0..length * length).map(|index| lower[index % length][index / length] as f32).collect();
-        let spread = Tensor::from_vec(transposed, (length, length), codes.device())?;
-        Ok(Self { mean, spread })
+        let transposed = |rows: &[Vec<f64>]| {
+            let values: Vec<f32> =
+                (0..length * length).map(|index| rows[index % length][index / length] as f32).collect();
+            Tensor::from_vec(values, (length, length), codes.device())
+        };
+        Ok(Self { mean, spread: transposed(&lower)?, inverse: transposed(&inverted(&lower))? })
     }
 
     /// D, the length of a code row.
@@ -45,6 +49,11 @@ impl CodeSpace {
     /// The model's codes `[N, D]` of whitened ones `[N, D]`. Differentiable.
     pub fn to_codes(&self, whitened: &Tensor) -> Result<Tensor> {
         Ok(self.displaced(whitened)?.broadcast_add(&self.mean)?)
+    }
+
+    /// The whitened codes `[N, D]` of the model's `[N, D]`: undoes [`Self::to_codes`].
+    pub fn whitened(&self, codes: &Tensor) -> Result<Tensor> {
+        Ok(codes.broadcast_sub(&self.mean)?.matmul(&self.inverse)?)
     }
 
     /// How far whitened displacements `[N, D]` move the model's codes, `[N, D]`. Differentiable.
@@ -87,6 +96,20 @@ fn cholesky(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     matrix
 }
 
+/// The inverse of a lower triangle with a positive diagonal.
+fn inverted(lower: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    let length = lower.len();
+    let mut inverse = vec![vec![0.0; length]; length];
+    for column in 0..length {
+        for row in column..length {
+            let sum: f64 = (column..row).map(|k| lower[row][k] * inverse[k][column]).sum();
+            let unit = if row == column { 1.0 } else { 0.0 };
+            inverse[row][column] = (unit - sum) / lower[row][row];
+        }
+    }
+    inverse
+}
+
 #[cfg(test)]
 mod tests {
     use candle_core::Device;
@@ -108,6 +131,10 @@ mod tests {
         for (found, expected) in spread(&space.to_codes(&white).unwrap()).iter().zip(&own) {
             assert!((found / expected - 1.0).abs() < 0.15, "{found} {expected}");
         }
+        // Back and forth; directions without spread amplify f32's rounding.
+        let back = space.whitened(&space.to_codes(&white).unwrap()).unwrap();
+        let off = (back - &white).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+        assert!(off < 1e-2, "{off}");
         let zero = Tensor::zeros((1, space.style_dim()), DType::F32, &Device::Cpu).unwrap();
         assert_eq!(space.to_portrait(&zero).unwrap().dims(), [1, 9, 2, space.style_dim()]);
     }

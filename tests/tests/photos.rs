@@ -122,6 +122,48 @@ fn files_that_are_no_parsers_are_refused_in_a_line() {
 }
 
 #[test]
+fn regions_are_found_without_help_unless_nobody_is_to_look() {
+    let folder = Folder::with_model("built_in_parser");
+    folder.photo("astronaut.png");
+    let line = format!("invert astronaut.png --model {MODEL} {FEW_STEPS}");
+    let run = folder.run(&format!("{line} --out parsed --json --no-progress")).done();
+    assert!(run.stderr.contains("regions parsed in"), "{}", run.stderr);
+    assert!(number(&run.json()["portraits"][0], "mask_miou") > 0.0);
+    let run = folder.run(&format!("{line} --parser none --out alone --json --no-progress")).done();
+    assert!(!run.stderr.contains("regions parsed in"), "{}", run.stderr);
+    assert!(run.json()["portraits"][0]["mask_miou"].is_null());
+}
+
+#[test]
+fn a_parser_is_trained_stopped_resumed_measured_and_used() {
+    let folder = Folder::with_model("train_parser");
+    folder.photo("astronaut.png");
+    let line = "train-parser --data ../shared/data --batch 2 --cartoons 2 --steps 3 --seed 4 --quiet --out";
+    folder.run(&format!("{line} run")).done();
+    let said = folder.run(&format!("{line} run"));
+    assert_eq!((said.code, said.stderr.lines().count()), (2, 1), "{}", said.stderr);
+    assert!(said.stderr.contains("--resume"), "{}", said.stderr);
+    let nothing_left =
+        folder.json("train-parser --data ../shared/data --batch 2 --cartoons 2 --steps 3 --seed 4 --resume --out run");
+    assert_eq!(nothing_left["interrupted"], false);
+    folder.run(&format!("{line} again")).done();
+    let parser = "run/parser.safetensors";
+    assert!(folder.read(parser) == folder.read("again/parser.safetensors"), "the same seed gave another parser");
+    let score =
+        folder.json(&format!("eval parser --data ../shared/data --count 3 --parser {parser} --sheet sheet.png"));
+    assert_eq!(number(&score, "count"), 3.0);
+    assert!((0.0..=1.0).contains(&number(&score, "mean_iou")) && number(&score["pose"], "direction_rad") >= 0.0);
+    assert_eq!(folder.picture("sheet.png").height() % (128 + 4), 4);
+    let line = format!("invert astronaut.png --model {MODEL} {FEW_STEPS} --out out --parser");
+    assert!(number(&folder.json(&format!("{line} {parser}"))["portraits"][0], "mask_miou") >= 0.0);
+    for wrong in [MODEL, "gone.safetensors"] {
+        let run = folder.run(&format!("{line} {wrong} --overwrite"));
+        assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{wrong}: {}", run.stderr);
+        assert!(run.stderr.contains(wrong), "{wrong}: {}", run.stderr);
+    }
+}
+
+#[test]
 fn a_face_parser_gives_the_regions() {
     let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/weights/face_parser_bisenetv2_448.onnx");
     if !weights.exists() {
@@ -131,7 +173,7 @@ fn a_face_parser_gives_the_regions() {
     let folder = Folder::with_model("parser");
     folder.photo("astronaut.png");
     let line = format!("invert astronaut.png --model {MODEL} {FEW_STEPS}");
-    assert!(folder.json(&format!("{line} --out plain"))["portraits"][0]["mask_miou"].is_null());
+    assert!(folder.json(&format!("{line} --parser none --out plain"))["portraits"][0]["mask_miou"].is_null());
     let run = folder.run(&format!("{line} --parser {} --out parsed --json --no-progress", weights.display())).done();
     assert!(run.stderr.contains("regions parsed in"), "{}", run.stderr);
     assert!(number(&run.json()["portraits"][0], "mask_miou") > 0.0);

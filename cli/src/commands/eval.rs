@@ -3,6 +3,7 @@
 mod consistency;
 mod inversion;
 mod locality;
+mod parser;
 mod quality;
 
 use std::path::{Path, PathBuf};
@@ -32,6 +33,8 @@ pub enum EvalCommand {
     Consistency(consistency::ConsistencyArguments),
     /// Whether edits stay in their region
     Locality(locality::LocalityArguments),
+    /// How well a face parser finds regions and head pose
+    Parser(parser::ParserArguments),
 }
 
 impl EvalCommand {
@@ -42,6 +45,7 @@ impl EvalCommand {
             Self::Inversion(inversion) => inversion.run(seed, console),
             Self::Consistency(consistency) => consistency.run(seed, console),
             Self::Locality(locality) => locality.run(seed, console),
+            Self::Parser(parser) => parser.run(console),
         }
     }
 }

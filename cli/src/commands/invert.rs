@@ -16,6 +16,7 @@ use cnerf_invert::{
     parser::{ParserConfig, RegionParser},
     photo::{PhotoOptions, Subject},
     portrait::Portrait,
+    start::NearStart,
 };
 use serde::Serialize;
 
@@ -75,6 +76,7 @@ struct Tools<'a> {
     generator: &'a Generator,
     perceptual: Option<&'a Perceptual>,
     parser: Option<&'a dyn RegionParser>,
+    near: Option<&'a NearStart>,
     interrupt: &'a Interrupt,
 }
 
@@ -148,10 +150,11 @@ impl InvertArguments {
         }
         let generator = self.model.load_or("portrait")?;
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
-        let parser = self.parser.load()?;
+        let parser = self.parser.load(cnerf_models::parser())?;
         let interrupt = Interrupt::listen()?;
-        let (perceptual, parser) = (perceptual.as_ref(), parser.as_deref());
-        let tools = Tools { generator: &generator, perceptual, parser, interrupt: &interrupt };
+        let near = self.model.near_start("portrait")?;
+        let (perceptual, parser, near) = (perceptual.as_ref(), parser.as_deref(), near.as_ref());
+        let tools = Tools { generator: &generator, perceptual, parser, near, interrupt: &interrupt };
         let mut report = Report::default();
         let groups: Vec<&[PathBuf]> =
             if self.same_person { vec![self.photos.as_slice()] } else { self.photos.chunks(1).collect() };
@@ -242,7 +245,11 @@ impl InvertArguments {
         let side = tools.generator.output_resolution() as u32;
         let mut subjects = Vec::with_capacity(photos.len());
         for photo in photos {
-            match Subject::read(photo, &options, tools.parser, side) {
+            let read = Subject::read(photo, &options, tools.parser, side).and_then(|mut subject| {
+                tools.near.map_or(Ok(()), |near| subject.start_near(near))?;
+                Ok(subject)
+            });
+            match read {
                 Ok(subject) => {
                     if let Some(seconds) = subject.parser_seconds {
                         console.note(format_args!("{}: regions parsed in {seconds:.1} s", photo.display()));

@@ -26,6 +26,7 @@ pub mod fused;
 pub mod peak;
 pub mod plain;
 pub mod prepared;
+pub mod rays;
 pub mod simd;
 
 pub use error::{Error, Result};

@@ -371,9 +371,15 @@ impl RadianceField for PortraitField {
     fn evaluate(&self, points: &Tensor, view_directions: Option<&Tensor>, outputs: Outputs) -> Result<Evaluation> {
         let rows = self.volume.shape.rows(outputs);
         let raw = self.volume.evaluate(points, view_directions, outputs)?;
-        let row = |index: usize| -> Result<Tensor> { Ok(raw.narrow(2, index, 1)?.squeeze(2)?) };
-        let block = |range: Option<std::ops::Range<usize>>| -> Result<Option<Tensor>> {
-            range.map(|range| Ok(raw.narrow(2, range.start, range.len())?)).transpose()
+        // The gradient of every part of a tensor is as large as the whole: the few rows before the activations are cut
+        // off in one piece, and the rest is cut from that.
+        let few = match &rows.activations {
+            Some(range) => raw.narrow(2, 0, range.start)?,
+            None => raw.clone(),
+        };
+        let row = |index: usize| -> Result<Tensor> { Ok(few.narrow(2, index, 1)?.squeeze(2)?) };
+        let cut = |from: &Tensor, range: Option<std::ops::Range<usize>>| -> Result<Option<Tensor>> {
+            range.map(|range| Ok(from.narrow(2, range.start, range.len())?)).transpose()
         };
         let scale = self.config.residual_scale;
         let masks = self.fuse(&row(rows.mask)?)?;
@@ -382,7 +388,7 @@ impl RadianceField for PortraitField {
             Residual::Sum => residuals.sum(1)?,
             Residual::Gated => (&masks * &residuals)?.sum(1)?,
         };
-        let mut gradient = match (block(rows.mask_gradient)?, block(rows.residual_gradient)?) {
+        let mut gradient = match (cut(&few, rows.mask_gradient)?, cut(&few, rows.residual_gradient)?) {
             (Some(mask), Some(residual)) => {
                 let residual = (residual * (scale * INPUT_SCALE))?;
                 Some(self.residual_gradient(&masks, &residuals, &(mask * INPUT_SCALE)?, &residual)?)
@@ -405,8 +411,8 @@ impl RadianceField for PortraitField {
             distance,
             masks,
             residuals,
-            colours: block(rows.colour)?,
-            activations: block(rows.activations)?,
+            colours: cut(&few, rows.colour)?,
+            activations: cut(&raw, rows.activations)?,
             gradient,
         })
     }

@@ -93,6 +93,9 @@ pub struct Frame {
 
 /// Points evaluated at once for pictures that nobody differentiates: about 200 MB of activations at width 128.
 const POINTS_AT_ONCE: usize = 1 << 14;
+/// Points evaluated at once for pictures that are differentiated: the graph grows with all of them, but the gradients
+/// of the activations, several times their size, live for one chunk at a time, in memory that the next one uses again.
+const DIFFERENTIABLE_POINTS_AT_ONCE: usize = 1 << 13;
 
 /// Pictures of `field` from `cameras` `[B, 6]` (see [`camera::Camera::parameters`]); [`plan::render`] without its report.
 pub fn render_frame<F: RadianceField>(field: &F, cameras: &Tensor, settings: &RenderSettings) -> Result<Frame> {
@@ -128,11 +131,8 @@ pub(super) fn render_exhaustively<F: RadianceField>(
     let (batch, resolution) = (cameras.dim(0)?, settings.resolution);
     let (rays, depths) = rays(cameras, settings)?;
     let count = resolution * resolution;
-    let chunk = if settings.differentiable {
-        count
-    } else {
-        (POINTS_AT_ONCE / (batch * settings.sampling.samples).max(1)).clamp(1, count)
-    };
+    let at_once = if settings.differentiable { DIFFERENTIABLE_POINTS_AT_ONCE } else { POINTS_AT_ONCE };
+    let chunk = (at_once / (batch * settings.sampling.samples).max(1)).clamp(1, count);
     let quiet = (!settings.differentiable).then(|| field.detached());
     let field = quiet.as_ref().unwrap_or(field);
     let outputs = Outputs { gradient: settings.normals, colour: true, activations: settings.features };

@@ -7,6 +7,7 @@ use candle_nn::ops::sigmoid;
 use crate::{
     camera,
     error::{Error, Result},
+    kernels::rays::weighted_ray_sum,
     region::{REGION_COUNT, RegionSet},
     render::{BackgroundEvaluation, Evaluation, RadianceField, RayBundle, norm_over},
 };
@@ -125,7 +126,9 @@ pub fn aggregate<F: RadianceField>(
     let pixel_masks = all_regions(&weights.sum(&masks)?, volume, behind)?;
     let features = match &evaluation.activations {
         Some(activations) => {
-            let activations = weights.sum(&masks.unsqueeze(2)?.broadcast_mul(activations)?)?;
+            let (batch, count, samples) = weights.weights.dims3()?;
+            let share = masks.broadcast_mul(&weights.weights.reshape((batch, 1, count * samples))?)?;
+            let activations = weighted_ray_sum(activations, &share, samples)?;
             let behind = match background.and_then(|background| background.activations.as_ref()) {
                 Some(activations) => Some(activations.broadcast_mul(&remaining)?.unsqueeze(1)?),
                 None => None,

@@ -55,6 +55,7 @@ pub fn subject(generator: &Generator, with_labels: bool) -> Subject {
         source: "made up".into(),
         aligned: Aligned { picture, transform, camera: Camera::at(0.1, 0.0), padded: 0.0 },
         labels: with_labels.then_some(labels),
+        start: None,
         parser_seconds: None,
         warnings: vec!["something to know".into()],
     }

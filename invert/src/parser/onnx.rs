@@ -19,7 +19,7 @@ use tract_onnx::{
     onnx, pb::GraphProto, prelude::*, tract_core::internal::DimLike as _, tract_hir::infer::Factoid as _,
 };
 
-use super::{PixelScale, RegionParser};
+use super::{Parsed, PixelScale, RegionParser};
 use crate::error::{Error, Result};
 
 /// Largest ONNX file read, bytes.
@@ -144,7 +144,7 @@ impl RegionParser for OnnxParser {
         self.input.width.min(self.input.height) as u32
     }
 
-    fn parse(&self, portrait: &RgbImage) -> Result<LabelMap> {
+    fn parse(&self, portrait: &RgbImage) -> Result<Parsed> {
         let refuse = |reason: String| Error::malformed(&self.path, reason);
         let (boxed, [left, top, side]) = self.letterboxed(portrait)?;
         let labels = contained(|| {
@@ -173,7 +173,7 @@ impl RegionParser for OnnxParser {
                 refuse(format!("gave label {label}, but {classes} classes are known; name all by --parser-classes"))
             })?]);
         }
-        Ok(LabelMap::translate(map, &self.scheme, &self.path)?)
+        Ok(Parsed { labels: LabelMap::translate(map, &self.scheme, &self.path)?, camera: None })
     }
 }
 

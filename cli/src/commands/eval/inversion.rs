@@ -11,7 +11,8 @@ use cnerf_core::{
 };
 use cnerf_invert::{
     config::InvertConfig,
-    evaluation::{EvaluationOptions, InversionScore, InversionSummary, People, Variant, invert_one},
+    evaluation::{EvaluationOptions, Helpers, InversionScore, InversionSummary, People, Variant, invert_one},
+    parser::ParserConfig,
 };
 use serde::Serialize;
 
@@ -46,6 +47,11 @@ pub struct InversionArguments {
     known_masks: bool,
     #[command(flatten)]
     config: InvertConfig,
+    #[command(flatten)]
+    parser: ParserConfig,
+    /// Begin at the model's mean portrait, not at a guess from photo and regions
+    #[arg(long)]
+    far_start: bool,
     /// LPIPS weights (safetensors): the perceptual loss, as in `invert`, and the `lpips` column
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
@@ -89,6 +95,9 @@ impl InversionArguments {
         let people = People::open(&self.data, self.count as usize, seed)?;
         let generator = self.model.load_or("portrait")?;
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
+        let parser = self.parser.load(cnerf_models::parser())?;
+        let near = if self.far_start { None } else { self.model.near_start("portrait")? };
+        let helpers = Helpers { perceptual: perceptual.as_ref(), parser: parser.as_deref(), near: near.as_ref() };
         let steps = self.config.steps();
         console.note(format_args!(
             "{} people of {} with `{}`: {:?}, {} steps on codes, {} on weights{}",
@@ -102,7 +111,7 @@ impl InversionArguments {
         ));
         let mut variants = Vec::new();
         for variant in &self.variant {
-            variants.push(self.measure(*variant, &generator, &people, perceptual.as_ref(), console));
+            variants.push(self.measure(*variant, &generator, &people, helpers, console));
         }
         let Some(first) = variants.first() else { bail!("--variant: name at least one") };
         if variants.iter().all(|measured| measured.portraits.is_empty()) {
@@ -122,7 +131,7 @@ impl InversionArguments {
         variant: Variant,
         generator: &Generator,
         people: &People,
-        perceptual: Option<&Perceptual>,
+        helpers: Helpers<'_>,
         console: &Console,
     ) -> Measured {
         let options = EvaluationOptions {
@@ -136,7 +145,7 @@ impl InversionArguments {
         let bar = console.bar(people.len() as u64, variant.name());
         for index in 0..people.len() {
             let input = people.name(index);
-            let result = invert_one(generator, people, index, perceptual, &options, &mut |done, all| {
+            let result = invert_one(generator, people, index, helpers, &options, &mut |done, all| {
                 bar.set_message(format!("{input}: step {done} of {all}"));
             });
             match result {

@@ -15,7 +15,7 @@ use cnerf_core::{
 };
 use cnerf_invert::{
     config::{Effort, InvertConfig},
-    evaluation::{EvaluationOptions, InversionSummary, People, Variant, invert_one},
+    evaluation::{EvaluationOptions, Helpers, InversionSummary, People, Variant, invert_one},
 };
 use serde::Serialize;
 
@@ -140,7 +140,7 @@ impl QualityArguments {
         let bar = console.bar(people.len() as u64, "masks");
         let mut scores = Vec::new();
         for index in 0..people.len() {
-            scores.push(invert_one(generator, &people, index, None, &options, &mut |_, _| {})?);
+            scores.push(invert_one(generator, &people, index, Helpers::default(), &options, &mut |_, _| {})?);
             bar.inc(1);
         }
         bar.finish_and_clear();
