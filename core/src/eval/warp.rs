@@ -71,38 +71,43 @@ impl Raster {
 
     /// A channel between its pixels' centres, bilinear: exact for linear functions.
     pub fn bilinear(&self, channel: usize, point: [f64; 2]) -> f64 {
-        self.sample(channel, point, |share| [0.0, 1.0 - share, share, 0.0])
+        self.sample(channel, taps(self.side, point, |share| [0.0, 1.0 - share, share, 0.0]))
     }
 
     /// A channel between its pixels' centres by the Catmull-Rom spline: exact for quadratic functions, and gentle to
     /// fine detail, which bilinear sampling blurs.
     pub fn cubic(&self, channel: usize, point: [f64; 2]) -> f64 {
-        self.sample(channel, point, |t| {
-            [
-                0.5 * t * (t * (2.0 - t) - 1.0),
-                0.5 * (t * t * (3.0 * t - 5.0) + 2.0),
-                0.5 * t * (t * (4.0 - 3.0 * t) + 1.0),
-                0.5 * t * t * (t - 1.0),
-            ]
-        })
+        self.sample(channel, taps(self.side, point, catmull_rom))
     }
 
-    fn sample(&self, channel: usize, [x, y]: [f64; 2], weights: impl Fn(f64) -> [f64; 4]) -> f64 {
+    fn sample(&self, channel: usize, taps: [(usize, f64); 16]) -> f64 {
         let Some(values) = self.channels.get(channel) else { return 0.0 };
-        let half = 0.5 * self.side as f64;
-        let (column, row) = ((x + 1.0) * half - 0.5, (1.0 - y) * half - 0.5);
-        let (across, down) = (weights(column - column.floor()), weights(row - row.floor()));
-        let clamped =
-            |value: f64, step: usize| (value.floor() as i64 + step as i64 - 1).clamp(0, self.side as i64 - 1) as usize;
-        let mut sum = 0.0;
-        for (step_down, weight_down) in down.into_iter().enumerate().filter(|(_, weight)| *weight != 0.0) {
-            let line = clamped(row, step_down) * self.side;
-            for (step, weight) in across.into_iter().enumerate().filter(|(_, weight)| *weight != 0.0) {
-                sum += weight_down * weight * values.get(line + clamped(column, step)).copied().unwrap_or_default();
-            }
-        }
-        sum
+        let weighted = taps.iter().filter(|(_, weight)| *weight != 0.0);
+        weighted.map(|(index, weight)| weight * values.get(*index).copied().unwrap_or_default()).sum()
     }
+}
+
+/// Weights of the four pixels around a place `t` of the way from the second to the third.
+fn catmull_rom(t: f64) -> [f64; 4] {
+    [
+        0.5 * t * (t * (2.0 - t) - 1.0),
+        0.5 * (t * t * (3.0 * t - 5.0) + 2.0),
+        0.5 * t * (t * (4.0 - 3.0 * t) + 1.0),
+        0.5 * t * t * (t - 1.0),
+    ]
+}
+
+/// The pixels around a point of a picture in row order, and their weights; beyond the edge its pixels are repeated.
+fn taps(side: usize, [x, y]: [f64; 2], weights: impl Fn(f64) -> [f64; 4]) -> [(usize, f64); 16] {
+    let half = 0.5 * side as f64;
+    let (column, row) = ((x + 1.0) * half - 0.5, (1.0 - y) * half - 0.5);
+    let (across, down) = (weights(column - column.floor()), weights(row - row.floor()));
+    let clamped =
+        |value: f64, step: usize| (value.floor() as i64 + step as i64 - 1).clamp(0, side as i64 - 1) as usize;
+    std::array::from_fn(|tap| {
+        let (step_down, step) = (tap / 4, tap % 4);
+        (clamped(row, step_down) * side + clamped(column, step), down[step_down] * across[step])
+    })
 }
 
 fn centre(index: usize, side: usize) -> [f64; 2] {
@@ -170,6 +175,30 @@ impl Warp {
     /// The pixels that both views see: index in the target, point in the source.
     pub fn visible(&self) -> impl Iterator<Item = (usize, [f64; 2])> {
         self.places.iter().enumerate().filter_map(|(index, place)| Some((index, (*place)?)))
+    }
+
+    /// What both views show of the same places, `[C, visible]` each: the target's own pixels, and what the source has
+    /// there (Catmull-Rom). Differentiable in both pictures `[1, C, side, side]`; none if nothing is seen by both.
+    pub fn seen_by_both(&self, target: &Tensor, source: &Tensor) -> Result<Option<[Tensor; 2]>> {
+        let &[1, channels, side, _] = target.dims() else {
+            return Err(Error::shape("picture", "[1, C, S, S]", target.dims()));
+        };
+        let pixels: Vec<u32> = self.visible().map(|(index, _)| index as u32).collect();
+        if pixels.is_empty() {
+            return Ok(None);
+        }
+        let taps: Vec<(usize, f64)> =
+            self.visible().flat_map(|(_, place)| taps(side, place, catmull_rom)).collect();
+        let rows = |picture: &Tensor| picture.reshape((channels, side * side));
+        let device = target.device();
+        let count = pixels.len();
+        let own = rows(target)?.index_select(&Tensor::from_vec(pixels, count, device)?, 1)?;
+        let indices: Vec<u32> = taps.iter().map(|(index, _)| *index as u32).collect();
+        let weights: Vec<f32> = taps.iter().map(|(_, weight)| *weight as f32).collect();
+        let weights = Tensor::from_vec(weights, (1, count, 16), device)?.to_dtype(target.dtype())?;
+        let found = rows(source)?.index_select(&Tensor::from_vec(indices, 16 * count, device)?, 1)?;
+        let found = found.reshape((channels, count, 16))?.broadcast_mul(&weights)?.sum(2)?;
+        Ok(Some([own, found]))
     }
 
     /// Share of the target's head that the source sees; 0 if there is no head.
@@ -247,6 +276,39 @@ mod tests {
         let same = Warp::new(&surface(target, false), &surface(target, false), SIDE);
         assert!(same.visible().all(|(index, place)| Raster::nearest(&surface(target, false).raster, place) == index));
         assert_eq!(same.visible_share(), 1.0);
+    }
+
+    #[test]
+    fn what_both_see_is_the_cubic_sample_and_differentiable() {
+        let (target, source) = (Camera::at(0.2, 0.0), Camera::at(-0.1, 0.1));
+        let warp = Warp::new(&surface(target, false), &surface(source, false), SIDE);
+        let values = |phase: f64| -> Vec<f64> { (0..2 * SIDE * SIDE).map(|i| (i as f64 * 0.37 + phase).sin()).collect() };
+        let picture = |values: &[f64]| Tensor::new(values, &Device::Cpu).unwrap().reshape((1, 2, SIDE, SIDE)).unwrap();
+        let (first, second) = (values(0.0), values(1.0));
+        let [own, found] = warp.seen_by_both(&picture(&first), &picture(&second)).unwrap().unwrap();
+        let (own, found) = (own.to_vec2::<f64>().unwrap(), found.to_vec2::<f64>().unwrap());
+        let raster = Raster::from_tensor(&picture(&second)).unwrap();
+        for (place, (index, point)) in warp.visible().enumerate() {
+            assert_eq!(own[1][place], first[SIDE * SIDE + index]);
+            // Weights are f32 in the tensor.
+            assert!((found[1][place] - raster.cubic(1, point)).abs() < 1e-6);
+        }
+        // The gradient of Σ found² in one pixel of the source against a central difference.
+        let variable = candle_core::Var::from_tensor(&picture(&second)).unwrap();
+        let loss = |source: &Tensor| {
+            let [_, found] = warp.seen_by_both(&picture(&first), source).unwrap().unwrap();
+            found.sqr().unwrap().sum_all().unwrap()
+        };
+        let gradients = loss(variable.as_tensor()).backward().unwrap();
+        let gradient = gradients.get(variable.as_tensor()).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
+        let pixel = SIDE * SIDE / 2 + SIDE / 2;
+        let at = |step: f64| {
+            let mut moved = second.clone();
+            moved[pixel] += step;
+            loss(&picture(&moved)).to_scalar::<f64>().unwrap()
+        };
+        let difference = (at(1e-4) - at(-1e-4)) / 2e-4;
+        assert!((gradient[pixel] - difference).abs() < 1e-5 * difference.abs(), "{} {difference}", gradient[pixel]);
     }
 
     #[test]

@@ -91,6 +91,21 @@ pub struct Frame {
     pub opacity: Tensor,
 }
 
+impl Frame {
+    /// The same part of every picture.
+    pub fn try_map(&self, part: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        Ok(Self {
+            colour: part(&self.colour)?,
+            features: self.features.as_ref().map(&part).transpose()?,
+            masks: part(&self.masks)?,
+            depth: part(&self.depth)?,
+            normal: self.normal.as_ref().map(&part).transpose()?,
+            point: part(&self.point)?,
+            opacity: part(&self.opacity)?,
+        })
+    }
+}
+
 /// Points evaluated at once for pictures that nobody differentiates: about 200 MB of activations at width 128.
 const POINTS_AT_ONCE: usize = 1 << 14;
 /// Points evaluated at once for pictures that are differentiated: the graph grows with all of them, but the gradients

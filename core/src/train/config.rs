@@ -212,9 +212,14 @@ pub struct UpsamplerStageConfig {
     /// The discriminator sees regions by their outlines, without shares: where masks are rendered and not learnt, their
     /// softness alone would tell it real from generated. Paper: off.
     pub hard_masks: bool,
-    /// Random portraits from random cameras a step, judged by the discriminator only. Paper: its whole batch; with
-    /// pairs, beside them.
+    /// Random portraits from random cameras a step, for the discriminator and for `agreement`. Paper: its whole batch;
+    /// with pairs, beside them.
     pub random_portraits: usize,
+    /// Weight of L1 between two views of each random portrait where both see the head, one carried to the other by the
+    /// rendered depth: what is drawn stays on the surface in an orbit. Paper: 0.
+    pub agreement: f64,
+    /// The second view is turned by up to this, radians; more often by less.
+    pub agreement_turn_rad: f64,
     /// Steps the discriminator learns alone before its verdict counts. Paper: 0.
     pub discriminator_ahead_steps: usize,
     /// Channels of the discriminator relative to the authors' tables.
@@ -311,6 +316,8 @@ impl TrainConfig {
                 adversarial_crop: 64,
                 hard_masks: true,
                 random_portraits: 2,
+                agreement: 0.0,
+                agreement_turn_rad: 0.5,
                 discriminator_ahead_steps: 200,
                 channel_multiplier: 0.125,
                 r1_image: 1.0,
@@ -377,6 +384,8 @@ impl TrainConfig {
             adversarial_crop: 512,
             hard_masks: false,
             random_portraits: 16,
+            agreement: 0.0,
+            agreement_turn_rad: 0.5,
             discriminator_ahead_steps: 0,
             channel_multiplier: 1.0,
             r1_image: 10.0,

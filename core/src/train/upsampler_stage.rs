@@ -1,10 +1,12 @@
 //! Stage `upsampler`: the field frozen, the 2D generator learns to lift its renders.
 //!
-//! Two teachers, mixed by their weights: the portrait a training code belongs to (shared/recipe: every warmed-up
-//! portrait's soft render is paired with its sharp photo; L1 and LPIPS on crops), and a high-resolution discriminator
-//! (the paper's second stage), which judges random portraits and, where there are pairs, their pictures too.
+//! Three teachers, mixed by their weights: the portrait a training code belongs to (shared/recipe: every warmed-up
+//! portrait's soft render is paired with its sharp photo; L1 and LPIPS on crops), a high-resolution discriminator
+//! (the paper's second stage), which judges random portraits and, where there are pairs, their pictures too, and the
+//! agreement of two views of a random portrait.
 
 mod adversary;
+mod agreement;
 mod pairs;
 
 use candle_core::{DType, Device, Tensor};
@@ -74,6 +76,21 @@ struct PairedPictures {
     fake: Judged,
 }
 
+/// Renders of random portraits; a person's views in a row.
+struct RandomRenders {
+    frame: Frame,
+    /// `[B, 9, 2, D]`.
+    codes: Tensor,
+    cameras: Vec<Camera>,
+}
+
+/// What random portraits give a step: pictures to judge, and the weighted disagreement of their views.
+#[derive(Default)]
+struct RandomPictures {
+    judged: Option<Judged>,
+    loss: Option<Tensor>,
+}
+
 impl UpsamplerStage {
     /// A fresh upsampler on the field of `start`, or the one it has if that is of the configured form.
     pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>) -> Result<Self> {
@@ -114,6 +131,9 @@ impl UpsamplerStage {
         }
         if adversary.is_some() && pairs.is_none() && stage.random_portraits == 0 {
             return Err(Error::config("upsampler.random_portraits", "must be at least 1 where there are no pairs"));
+        }
+        if stage.agreement > 0.0 && stage.random_portraits == 0 {
+            return Err(Error::config("upsampler.agreement", "compares random portraits; set upsampler.random_portraits"));
         }
         Ok(Self {
             average: Average::of(&generator.parameters().within("upsampler"), stage.average_half_life_images)?,
@@ -158,19 +178,40 @@ impl UpsamplerStage {
         Ok(Some(PairedPictures { loss, real, fake }))
     }
 
+    /// Pictures of random portraits for the discriminator, and how far their views disagree.
+    fn random_pictures(&self, step: usize, metrics: &mut Metrics) -> Result<RandomPictures> {
+        let config = &self.config;
+        if config.random_portraits == 0 || (self.adversary.is_none() && config.agreement == 0.0) {
+            return Ok(RandomPictures::default());
+        }
+        let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
+        let views = if config.agreement > 0.0 { agreement::VIEWS } else { 1 };
+        let renders = self.random_renders(config.random_portraits, views, &mut random)?;
+        let square = Square::random(config.crop, self.generator.render_resolution(), &mut random);
+        if config.agreement == 0.0 {
+            let frame = square.of_frame(&renders.frame)?;
+            let output = self.generator.upsample_with(&frame, &renders.codes, None, Noise::Drawn(&mut random))?;
+            return Ok(RandomPictures { judged: Some(Judged { image: output.rgb, masks: output.masks }), loss: None });
+        }
+        // Views are compared whole: squares of them would show other parts of the head.
+        let output = self.generator.upsample_with(&renders.frame, &renders.codes, None, Noise::Drawn(&mut random))?;
+        let loss = agreement::disagreement(&output.rgb, &renders.frame, &renders.cameras)?;
+        if let Some(loss) = &loss {
+            metrics.push_loss("agreement", loss)?;
+        }
+        let factor = self.generator.output_resolution() / self.generator.render_resolution();
+        let judged = Judged { image: square.of(&output.rgb, factor)?, masks: square.of(&output.masks, factor)? };
+        Ok(RandomPictures { judged: Some(judged), loss: loss.map(|loss| loss * config.agreement).transpose()? })
+    }
+
     /// Trains the discriminator and returns the generator's adversarial loss.
     fn adversarial_loss(
         &mut self,
         step: usize,
         paired: Option<(Judged, Judged)>,
+        random_portraits: Option<Judged>,
         metrics: &mut Metrics,
     ) -> Result<Option<Tensor>> {
-        if self.adversary.is_none() {
-            return Ok(None);
-        }
-        let random_portraits = (self.config.random_portraits > 0)
-            .then(|| self.random_pictures(&mut Stream::new(self.seed, &[STREAM, step as u64, 1])))
-            .transpose()?;
         let Some(adversary) = &mut self.adversary else { return Ok(None) };
         let (real, fake) = match (paired, random_portraits) {
             (Some((real, fake)), Some(random)) => (Some(real), Some(fake.and(&random)?)),
@@ -192,7 +233,8 @@ impl UpsamplerStage {
         // Only StyleGAN2's synthesis has a graph from latents to picture laid down.
         let Some(Upsampler::StyleGan2(network)) = self.generator.upsampler() else { return Ok(None) };
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 2]);
-        let (frame, codes) = self.random_renders((config.batch / PATH_BATCH_SHRINK).max(1), &mut random)?;
+        let RandomRenders { frame, codes, .. } =
+            self.random_renders((config.batch / PATH_BATCH_SHRINK).max(1), 1, &mut random)?;
         let input = Generator::upsampler_input(&frame)?;
         let latents = network.latents(&self.generator.upsampler_style(&codes, None)?)?;
         let features = network.transfer_features(&input.features)?;
@@ -206,24 +248,24 @@ impl UpsamplerStage {
         Ok(Some((path.penalty * (config.path_length * every as f64))?))
     }
 
-    /// Renders of random portraits from random cameras, and their codes; the field gets no gradient.
-    fn random_renders(&self, count: usize, random: &mut Stream) -> Result<(Frame, Tensor)> {
-        let z = random.normal_tensor(&[count, self.generator.config().field.style_dim], &self.device)?;
+    /// Renders of random portraits from `views` random cameras each; the field gets no gradient.
+    fn random_renders(&self, people: usize, views: usize, random: &mut Stream) -> Result<RandomRenders> {
+        let z = random.normal_tensor(&[people, self.generator.config().field.style_dim], &self.device)?;
         let codes = codes::broadcast(&self.generator.map(&self.generator.spread(&z)?)?.detach())?;
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
-        let cameras: Vec<Camera> = (0..count)
-            .map(|_| Camera::at(f64::from(random.normal()) * azimuth, f64::from(random.normal()) * elevation))
-            .collect();
-        let cameras = Camera::parameter_tensor(&cameras, &self.device)?;
-        Ok((self.generator.render(&codes, &cameras, &pairs::settings(&self.generator))?, codes))
-    }
-
-    /// Pictures of random portraits from random cameras: the square a step's pairs would show.
-    fn random_pictures(&self, random: &mut Stream) -> Result<Judged> {
-        let (frame, codes) = self.random_renders(self.config.random_portraits, random)?;
-        let frame = Square::random(self.config.crop, self.generator.render_resolution(), random).of_frame(&frame)?;
-        let output = self.generator.upsample_with(&frame, &codes, None, Noise::Drawn(random))?;
-        Ok(Judged { image: output.rgb, masks: output.masks })
+        let mut cameras = Vec::new();
+        for _ in 0..people {
+            let first = Camera::at(f64::from(random.normal()) * azimuth, f64::from(random.normal()) * elevation);
+            cameras.push(first);
+            for _ in 1..views {
+                cameras.push(agreement::turned(first, self.config.agreement_turn_rad, random));
+            }
+        }
+        let rows: Vec<u32> = (0..people * views).map(|index| (index / views) as u32).collect();
+        let codes = codes.index_select(&Tensor::new(rows, &self.device)?, 0)?;
+        let parameters = Camera::parameter_tensor(&cameras, &self.device)?;
+        let frame = self.generator.render(&codes, &parameters, &pairs::settings(&self.generator))?;
+        Ok(RandomRenders { frame, codes, cameras })
     }
 }
 
@@ -234,8 +276,9 @@ impl StageRun for UpsamplerStage {
             Some(paired) => (Some(paired.loss), Some((paired.real, paired.fake))),
             None => (None, None),
         };
-        let losses =
-            [paired_loss, self.adversarial_loss(step, pictures, &mut metrics)?, self.path_length(step, &mut metrics)?];
+        let random = self.random_pictures(step, &mut metrics)?;
+        let adversarial = self.adversarial_loss(step, pictures, random.judged, &mut metrics)?;
+        let losses = [paired_loss, random.loss, adversarial, self.path_length(step, &mut metrics)?];
         let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
         let total =
             total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
@@ -352,9 +395,11 @@ mod tests {
         let portraits = dataset(folder.path(), 4);
         let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
         let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=0", "random_portraits=2"];
+        let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
         for (settings, quantities) in [
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
             (alone, &["discriminator", "adversarial"][..]),
+            (agreeing, &["pixels", "discriminator", "adversarial", "agreement"][..]),
         ] {
             let mut whole = stage(&portraits, &settings);
             let before = state(&whole);

@@ -60,16 +60,7 @@ impl Square {
 
     /// The square of every part of a render.
     pub fn of_frame(&self, frame: &Frame) -> Result<Frame> {
-        let part = |picture: &Tensor| self.of(picture, 1);
-        Ok(Frame {
-            colour: part(&frame.colour)?,
-            masks: part(&frame.masks)?,
-            depth: part(&frame.depth)?,
-            point: part(&frame.point)?,
-            opacity: part(&frame.opacity)?,
-            features: frame.features.as_ref().map(part).transpose()?,
-            normal: frame.normal.as_ref().map(part).transpose()?,
-        })
+        frame.try_map(|picture| self.of(picture, 1))
     }
 }
 
