@@ -60,6 +60,7 @@ fn one_line(message: &str) -> String {
 
 /// The terminal, as quiet or talkative as asked.
 pub struct Console {
+    mute: bool,
     quiet: bool,
     json: bool,
     progress: bool,
@@ -83,7 +84,13 @@ impl Console {
         if let Some(threads) = options.threads {
             let _ = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads)).build_global();
         }
-        Self { quiet: options.quiet, json: options.json, progress: !options.quiet && !options.no_progress }
+        let progress = !options.quiet && !options.no_progress;
+        Self { mute: false, quiet: options.quiet, json: options.json, progress }
+    }
+
+    /// One that shows nothing: of processes that work together one speaks.
+    pub fn mute() -> Self {
+        Self { mute: true, quiet: true, json: false, progress: false }
     }
 
     /// A progress bar of `length` steps on stderr; invisible where it would not be one.
@@ -121,7 +128,9 @@ impl Console {
 
     /// A warning, on stderr even when quiet.
     pub fn warn(&self, line: impl std::fmt::Display) {
-        eprintln!("warning: {line}");
+        if !self.mute {
+            eprintln!("warning: {line}");
+        }
     }
 
     /// A fault in one line, on stderr.
@@ -136,6 +145,10 @@ impl Console {
     /// The result: as one JSON object with `--json`, else as `summary`.
     pub fn result<T: Serialize>(&self, value: &T, summary: impl FnOnce() -> String) -> anyhow::Result<()> {
         use std::io::Write as _;
+
+        if self.mute {
+            return Ok(());
+        }
         let text = if self.json { serde_json::to_string(value)? } else { summary() };
         // A closed pipe (`cnerf info x | head -1`) is the reader's choice, not a fault.
         if !text.is_empty() {

@@ -4,14 +4,17 @@ pub mod adversarial;
 pub mod average;
 pub mod checkpoint;
 pub mod config;
+pub mod estimate;
 pub mod events;
 pub mod field_stage;
 pub mod losses;
 pub mod optimiser;
 pub mod portrait_codes;
 pub mod preview;
+pub mod team;
 #[cfg(test)]
 mod test_data;
+pub mod texture;
 pub mod trainer;
 pub mod upsampler_stage;
 pub mod warmup;

@@ -14,7 +14,9 @@ use cnerf_core::{
     parameters::Parameters,
     train::{
         config::{Preset, Stage, TrainConfig},
+        estimate::{Estimate, estimate},
         events::Event,
+        team::Team,
         trainer::{Inputs, Start, Trainer, steps},
     },
 };
@@ -50,7 +52,7 @@ pub struct TrainArguments {
     /// Continue the run in --out
     #[arg(long)]
     resume: bool,
-    /// Print the resolved configuration and sizes, and stop
+    /// Print the resolved configuration, sizes, and the time and memory it will take by a few steps done here, and stop
     #[arg(long)]
     dry_run: bool,
     /// Change one setting, e.g. warmup.steps=500; may repeat
@@ -80,26 +82,37 @@ struct DryRun {
     portraits: usize,
     generator_parameters: usize,
     steps: usize,
+    estimates: Vec<Estimate>,
+    /// Stages without an estimate, and why.
+    not_estimated: Vec<String>,
 }
 
 impl TrainArguments {
     /// Trains until done or interrupted.
     pub fn run(self, seed: Option<u64>, console: &Console) -> anyhow::Result<Outcome> {
+        let team = team()?;
+        let outcome =
+            if team.leads() { self.run_in(&team, seed, console) } else { self.run_in(&team, seed, &Console::mute()) }?;
+        team.finish();
+        Ok(outcome)
+    }
+
+    fn run_in(&self, team: &Team, seed: Option<u64>, console: &Console) -> anyhow::Result<Outcome> {
         let config = self.resolve(seed)?;
         let dataset = Arc::new(Dataset::open(&self.data)?);
-        if self.dry_run {
-            return self.dry_run(&config, dataset.len(), console);
-        }
         let device = self.model.device()?;
         let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &device)).transpose()?;
         let start = self.model.model.as_ref().map(|name| self.start(name, &device)).transpose()?;
-        let inputs = Inputs { dataset, perceptual, start, device };
+        let inputs = Inputs { dataset, perceptual, start, device, team: team.clone() };
+        if self.dry_run {
+            return self.dry_run(&config, &inputs, console);
+        }
         let trainer = if self.resume {
             Trainer::resume(config, self.stage, inputs, &self.out)?
         } else {
             Trainer::new(config, self.stage, inputs, &self.out)?
         };
-        self.listen(trainer, console)
+        self.listen(trainer, team, console)
     }
 
     /// A run's model with its portraits' codes, or a built-in model without.
@@ -150,19 +163,32 @@ impl TrainArguments {
         words.join(" ")
     }
 
-    fn dry_run(&self, config: &TrainConfig, portraits: usize, console: &Console) -> anyhow::Result<Outcome> {
+    fn dry_run(&self, config: &TrainConfig, inputs: &Inputs, console: &Console) -> anyhow::Result<Outcome> {
+        let portraits = inputs.dataset.len();
         let parameters = Parameters::fresh(config.seed, candle_core::DType::F32, &candle_core::Device::Cpu);
         Generator::new(&config.model, &parameters)?;
         let steps = steps(config, self.stage);
-        let report = DryRun { config: config.clone(), portraits, generator_parameters: parameters.count(), steps };
+        let (mut estimates, mut not_estimated) = (Vec::new(), Vec::new());
+        for (stage, found) in estimate(config, self.stage, inputs)? {
+            match found {
+                Ok(found) => estimates.push(found),
+                Err(reason) => not_estimated.push(format!("{stage:?}: {reason}").to_lowercase()),
+            }
+        }
+        let generator_parameters = parameters.count();
+        let report =
+            DryRun { config: config.clone(), portraits, generator_parameters, steps, estimates, not_estimated };
         console.result(&report, || {
             let text = config.to_toml().unwrap_or_default();
-            format!("{text}\n{portraits} portraits · {} parameters · {steps} steps", report.generator_parameters)
+            let sizes = format!("{portraits} portraits · {generator_parameters} parameters · {steps} steps");
+            let estimates = report.estimates.iter().map(described);
+            let missing = report.not_estimated.iter().map(|stage| format!("no estimate of {stage}"));
+            [text, sizes].into_iter().chain(estimates).chain(missing).collect::<Vec<_>>().join("\n")
         })?;
         Ok(Outcome::Done)
     }
 
-    fn listen(&self, mut trainer: Trainer, console: &Console) -> anyhow::Result<Outcome> {
+    fn listen(&self, mut trainer: Trainer, team: &Team, console: &Console) -> anyhow::Result<Outcome> {
         let interrupt = Interrupt::listen()?;
         let began = std::time::Instant::now();
         let mut bar = console.bar(0, "");
@@ -188,7 +214,7 @@ impl TrainArguments {
                     Event::Warning(text) => bar.suspend(|| console.warn(text)),
                 }
             }
-            if interrupt.asked() {
+            if team.any(interrupt.asked())? {
                 if let Some(path) = trainer.checkpoint()? {
                     bar.suspend(|| console.note(path.display()));
                 }
@@ -212,5 +238,37 @@ impl TrainArguments {
             _ => format!("stopped after step {}; continue with: {resume}", report.steps),
         })?;
         Ok(if interrupted { Outcome::Partial } else { Outcome::Done })
+    }
+}
+
+/// An estimate in one line.
+fn described(estimate: &Estimate) -> String {
+    let Estimate { stage, steps, seconds_a_step, seconds, memory_bytes } = estimate;
+    let stage = format!("{stage:?}").to_lowercase();
+    let memory = memory_bytes.map(|bytes| format!(", {:.1} GB", bytes as f64 / 1e9)).unwrap_or_default();
+    let time = match seconds {
+        seconds if *seconds < 90.0 => format!("{seconds:.0} s"),
+        seconds if *seconds < 5_400.0 => format!("{:.0} min", seconds / 60.0),
+        seconds if *seconds < 172_800.0 => format!("{:.1} h", seconds / 3_600.0),
+        seconds => format!("{:.0} days", seconds / 86_400.0),
+    };
+    format!("{stage}: {steps} steps of about {seconds_a_step:.2} s here, {time}{memory}")
+}
+
+/// The processes that train together: those that `mpirun` started.
+#[cfg(feature = "mpi")]
+fn team() -> anyhow::Result<Team> {
+    Ok(Team::from_mpi()?)
+}
+
+/// One process alone; several would write over each other's run.
+#[cfg(not(feature = "mpi"))]
+fn team() -> anyhow::Result<Team> {
+    let count = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"].iter().find_map(|name| std::env::var(name).ok());
+    match count.filter(|count| count != "1") {
+        Some(count) => {
+            bail!("{count} processes were started and this cnerf cannot train in several; build it with --features mpi")
+        }
+        None => Ok(Team::default()),
     }
 }

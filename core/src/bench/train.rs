@@ -32,6 +32,7 @@ use crate::{
         events::Metrics,
         field_stage::FieldStage,
         losses,
+        team::Team,
         trainer::{Inputs, StageRun},
         warmup::Warmup,
     },
@@ -351,7 +352,13 @@ impl Portraits {
     }
 
     fn inputs(&self) -> Inputs {
-        Inputs { dataset: Arc::clone(&self.dataset), perceptual: None, start: None, device: Device::Cpu }
+        Inputs {
+            dataset: Arc::clone(&self.dataset),
+            perceptual: None,
+            start: None,
+            device: Device::Cpu,
+            team: Team::default(),
+        }
     }
 }
 

@@ -23,6 +23,7 @@ use crate::{
     error::{Error, Result},
     region::REGION_COUNT,
     rng::Stream,
+    train::team::Share,
 };
 
 /// What a random draw decides; part of the draw's path.
@@ -88,11 +89,16 @@ pub struct LoaderConfig {
     pub prefetch: usize,
     /// Seed of order and mirroring.
     pub seed: u64,
+    /// The process among those that share every batch: its rows are delivered of a whole batch that is as many times
+    /// larger.
+    #[serde(skip)]
+    pub share: Share,
 }
 
 impl Default for LoaderConfig {
     fn default() -> Self {
-        Self { resolutions: vec![64], batch: 16, mirror: true, workers: 2, prefetch: 4, seed: 0 }
+        let share = Share::default();
+        Self { resolutions: vec![64], batch: 16, mirror: true, workers: 2, prefetch: 4, seed: 0, share }
     }
 }
 
@@ -175,7 +181,7 @@ impl Loader {
             let work = move || {
                 let mut order = Order::new(config.seed, dataset.len(), config.mirror);
                 for step in pending {
-                    let draws = order.batch(step, config.batch);
+                    let draws = config.share.pick(&order.batch(step, config.share.whole(config.batch)));
                     let batch = assemble(&dataset, step, draws, &config.resolutions);
                     if results.send((step, batch)).is_err() {
                         return;

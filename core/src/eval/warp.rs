@@ -102,8 +102,7 @@ fn taps(side: usize, [x, y]: [f64; 2], weights: impl Fn(f64) -> [f64; 4]) -> [(u
     let half = 0.5 * side as f64;
     let (column, row) = ((x + 1.0) * half - 0.5, (1.0 - y) * half - 0.5);
     let (across, down) = (weights(column - column.floor()), weights(row - row.floor()));
-    let clamped =
-        |value: f64, step: usize| (value.floor() as i64 + step as i64 - 1).clamp(0, side as i64 - 1) as usize;
+    let clamped = |value: f64, step: usize| (value.floor() as i64 + step as i64 - 1).clamp(0, side as i64 - 1) as usize;
     std::array::from_fn(|tap| {
         let (step_down, step) = (tap / 4, tap % 4);
         (clamped(row, step_down) * side + clamped(column, step), down[step_down] * across[step])
@@ -187,8 +186,7 @@ impl Warp {
         if pixels.is_empty() {
             return Ok(None);
         }
-        let taps: Vec<(usize, f64)> =
-            self.visible().flat_map(|(_, place)| taps(side, place, catmull_rom)).collect();
+        let taps: Vec<(usize, f64)> = self.visible().flat_map(|(_, place)| taps(side, place, catmull_rom)).collect();
         let rows = |picture: &Tensor| picture.reshape((channels, side * side));
         let device = target.device();
         let count = pixels.len();
@@ -282,7 +280,8 @@ mod tests {
     fn what_both_see_is_the_cubic_sample_and_differentiable() {
         let (target, source) = (Camera::at(0.2, 0.0), Camera::at(-0.1, 0.1));
         let warp = Warp::new(&surface(target, false), &surface(source, false), SIDE);
-        let values = |phase: f64| -> Vec<f64> { (0..2 * SIDE * SIDE).map(|i| (i as f64 * 0.37 + phase).sin()).collect() };
+        let values =
+            |phase: f64| -> Vec<f64> { (0..2 * SIDE * SIDE).map(|i| (i as f64 * 0.37 + phase).sin()).collect() };
         let picture = |values: &[f64]| Tensor::new(values, &Device::Cpu).unwrap().reshape((1, 2, SIDE, SIDE)).unwrap();
         let (first, second) = (values(0.0), values(1.0));
         let [own, found] = warp.seen_by_both(&picture(&first), &picture(&second)).unwrap().unwrap();

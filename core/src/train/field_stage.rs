@@ -31,6 +31,7 @@ use crate::{
         optimiser::{Adam, Betas, Group},
         portrait_codes::PortraitCodes,
         preview,
+        team::{Share, Team},
         trainer::{Inputs, StageRun, Start},
     },
 };
@@ -43,6 +44,7 @@ pub struct FieldStage {
     config: FieldStageConfig,
     seed: u64,
     device: Device,
+    team: Team,
     dtype: DType,
     loader: Loader,
     next_batch: usize,
@@ -114,14 +116,17 @@ impl FieldStage {
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
         let group = |variables, learning_rate| Group { variables, learning_rate, largest_gradient_norm: None };
         let trained = ["field", "mapping"].iter().flat_map(|name| generator.parameters().within(name).variables());
-        let generator_optimiser = Adam::new(vec![group(trained.collect(), stage.generator_learning_rate)], betas);
+        let generator_optimiser =
+            Adam::new(vec![group(trained.collect(), stage.generator_learning_rate)], betas).in_team(&inputs.team);
         let discriminator_optimiser =
-            Adam::new(vec![group(discriminators.variables(), stage.discriminator_learning_rate)], betas);
+            Adam::new(vec![group(discriminators.variables(), stage.discriminator_learning_rate)], betas)
+                .in_team(&inputs.team);
         let loader_config = LoaderConfig {
             resolutions: vec![stage.resolution],
             batch: stage.batch,
             mirror: config.mirror,
             seed: config.seed,
+            share: inputs.team.share(),
             ..LoaderConfig::default()
         };
         Ok(Self {
@@ -134,6 +139,7 @@ impl FieldStage {
             config: stage,
             seed: config.seed,
             device: inputs.device.clone(),
+            team: inputs.team.clone(),
             dtype,
             generator,
             global,
@@ -154,9 +160,18 @@ impl FieldStage {
         self.loader.next_batch()
     }
 
-    /// w of fresh portraits, `[B, D]`.
+    fn share(&self) -> Share {
+        self.team.share()
+    }
+
+    /// Portraits in a step of the whole team: what random draws are made for.
+    fn whole_batch(&self) -> usize {
+        self.share().whole(self.config.batch)
+    }
+
+    /// w of fresh portraits of the whole team, `[B, D]`.
     fn draw_w(&self, random: &mut Stream) -> Result<Tensor> {
-        let shape = [self.config.batch, self.generator.config().field.style_dim];
+        let shape = [self.whole_batch(), self.generator.config().field.style_dim];
         let z = random.normal_tensor(&shape, &self.device)?.to_dtype(self.dtype)?;
         self.generator.map(&self.generator.spread(&z)?)
     }
@@ -164,7 +179,8 @@ impl FieldStage {
     fn draw_cameras(&self, random: &mut Stream) -> Vec<Camera> {
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
         let mut draw = |deviation: f64| f64::from(random.normal()) * deviation;
-        (0..self.config.batch).map(|_| Camera::at(draw(azimuth), draw(elevation))).collect()
+        let whole: Vec<Camera> = (0..self.whole_batch()).map(|_| Camera::at(draw(azimuth), draw(elevation))).collect();
+        self.share().pick(&whole)
     }
 
     /// Renders codes `[B, 9, 2, D]`; with `outputs.gradient` for the eikonal loss. Every region at every sample: what a
@@ -183,7 +199,8 @@ impl FieldStage {
         let rays =
             RayBundle::new(camera::cast(&parameters, &pixels, settings.resolution, settings.field_of_view_rad)?)?;
         let (batch, count) = rays.dimensions()?;
-        let depths = sampling.perturbed(batch, count, random, self.dtype, &self.device)?;
+        let depths = sampling.perturbed(self.share().whole(batch), count, random, self.dtype, &self.device)?;
+        let depths = self.share().of(&depths)?;
         let output = render_rays(&field, &rays, &depths, &sampling, outputs, RegionSet::ALL)?;
         let picture = |rows: &Tensor| rows.reshape((batch, rows.dim(1)?, settings.resolution, settings.resolution));
         Ok(Fakes {
@@ -216,7 +233,7 @@ impl FieldStage {
         metrics.push_loss("global", &loss.logistic)?;
         let mut total = loss.total;
         if self.config.semantic > 0.0 {
-            let regions = draw_regions(self.config.batch, &mut random);
+            let regions = self.share().pick(&draw_regions(self.whole_batch(), &mut random));
             let labels = class_labels(&regions, &self.device)?;
             let loss = discriminator_loss(
                 &self.semantic,
@@ -275,7 +292,7 @@ impl FieldStage {
             Ok(terms.total)
         })?;
         if config.semantic > 0.0 {
-            let regions = draw_regions(config.batch, random);
+            let regions = self.share().pick(&draw_regions(self.whole_batch(), random));
             let labels = class_labels(&regions, &self.device)?;
             let masks = select_masks(&fakes.masks, &regions)?;
             let loss = through([&fakes.image, &masks], |[image, masks]| {
@@ -296,8 +313,8 @@ impl FieldStage {
 
     /// L_STD: two portraits' shape and texture rows, crossed and rendered from the same cameras.
     fn decoupling(&self, random: &mut Stream) -> Result<Tensor> {
-        let first = codes::broadcast(&self.draw_w(random)?)?;
-        let second = codes::broadcast(&self.draw_w(random)?)?;
+        let first = self.share().of(&codes::broadcast(&self.draw_w(random)?)?)?;
+        let second = self.share().of(&codes::broadcast(&self.draw_w(random)?)?)?;
         let cameras = self.draw_cameras(random);
         let cross =
             |shape: &Tensor, texture: &Tensor| Tensor::cat(&[shape.narrow(2, 0, 1)?, texture.narrow(2, 1, 1)?], 2);
@@ -326,9 +343,9 @@ impl FieldStage {
         let first = self.draw_w(random)?;
         if random.chance(self.config.mixing as f32) {
             let second = self.draw_w(random)?;
-            return codes::mix(&first, &second, random);
+            return self.share().of(&codes::mix(&first, &second, random)?);
         }
-        codes::broadcast(&first)
+        self.share().of(&codes::broadcast(&first)?)
     }
 }
 
@@ -342,7 +359,7 @@ impl StageRun for FieldStage {
         let gradients = self.generator_gradients(step, &mut metrics)?;
         let norms = self.generator_optimiser.step(&gradients, 1.0)?;
         metrics.push("generator_norm", norms.iter().sum());
-        self.average.update(self.generator.parameters(), self.config.batch)?;
+        self.average.update(self.generator.parameters(), self.whole_batch())?;
         Ok(metrics)
     }
 
@@ -415,7 +432,13 @@ mod tests {
         // Far above the distance of untrained pictures, so that the margin's hinge is open and its gradient counts.
         config.field.decoupling_margin = 10.0;
         model(&mut config.model);
-        let inputs = Inputs { dataset: dataset(folder, 6), perceptual: None, start: None, device: Device::Cpu };
+        let inputs = Inputs {
+            dataset: dataset(folder, 6),
+            perceptual: None,
+            start: None,
+            device: Device::Cpu,
+            team: Team::default(),
+        };
         let stage = FieldStage::with_type(&config, &inputs, None, DType::F64).unwrap();
         // Fresh biases are zero and so are most masks: activations would sit exactly on the kink of their leaky ReLU.
         let mut random = Stream::new(1, &[]);

@@ -7,6 +7,7 @@ use candle_core::{Tensor, Var, backprop::GradStore};
 use crate::{
     error::{Error, Result},
     model::file::Tensors,
+    train::team::Team,
 };
 
 /// A set of variables that share a learning rate and a gradient bound.
@@ -34,23 +35,41 @@ pub struct Adam {
     betas: Betas,
     moments: BTreeMap<String, (Tensor, Tensor)>,
     step: u64,
+    team: Team,
 }
 
 impl Adam {
     /// An optimiser at step 0.
     pub fn new(groups: Vec<Group>, betas: Betas) -> Self {
-        Self { groups, betas, moments: BTreeMap::new(), step: 0 }
+        Self { groups, betas, moments: BTreeMap::new(), step: 0, team: Team::default() }
+    }
+
+    /// The same, stepping along the mean gradient of a whole team.
+    #[must_use]
+    pub fn in_team(self, team: &Team) -> Self {
+        Self { team: team.clone(), ..self }
     }
 
     /// One step along `gradients`, learning rates multiplied by `factor`. Returns each group's gradient norm before
     /// bounding. Variables without a gradient stay as they are. A norm that is not finite changes nothing and is an
     /// error.
     pub fn step(&mut self, gradients: &GradStore, factor: f64) -> Result<Vec<f64>> {
+        let mut means = self.team.means(&self.groups, gradients)?.map(Vec::into_iter);
+        // The gradients of all groups' variables, in order.
+        let mut gradient_of = |variable: &Var| match &mut means {
+            Some(means) => means.next().flatten(),
+            None => gradients.get(variable).map(Tensor::detach),
+        };
+        let gradients: Vec<Vec<Option<Tensor>>> = self
+            .groups
+            .iter()
+            .map(|group| group.variables.iter().map(|(_, variable)| gradient_of(variable)).collect())
+            .collect();
         let mut norms = Vec::with_capacity(self.groups.len());
-        for group in &self.groups {
+        for (group, gradients) in self.groups.iter().zip(&gradients) {
             let mut square = 0.0;
-            for (name, variable) in &group.variables {
-                if let Some(gradient) = gradients.get(variable) {
+            for ((name, _), gradient) in group.variables.iter().zip(gradients) {
+                if let Some(gradient) = gradient {
                     let sum =
                         f64::from(gradient.sqr()?.sum_all()?.to_dtype(candle_core::DType::F32)?.to_scalar::<f32>()?);
                     if !sum.is_finite() {
@@ -64,11 +83,11 @@ impl Adam {
         self.step += 1;
         let correction_first = 1.0 - self.betas.first.powf(self.step as f64);
         let correction_second = 1.0 - self.betas.second.powf(self.step as f64);
-        for (group, norm) in self.groups.iter().zip(&norms) {
+        for ((group, gradients), norm) in self.groups.iter().zip(gradients).zip(&norms) {
             let bound = group.largest_gradient_norm.map_or(1.0, |largest| (largest / norm.max(1e-12)).min(1.0));
-            for (name, variable) in &group.variables {
-                let Some(gradient) = gradients.get(variable) else { continue };
-                let gradient = if bound < 1.0 { (gradient.detach() * bound)? } else { gradient.detach() };
+            for ((name, variable), gradient) in group.variables.iter().zip(gradients) {
+                let Some(gradient) = gradient else { continue };
+                let gradient = if bound < 1.0 { (gradient * bound)? } else { gradient };
                 let (first, second) = match self.moments.remove(name) {
                     Some(moments) => moments,
                     None => (gradient.zeros_like()?, gradient.zeros_like()?),

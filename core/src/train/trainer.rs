@@ -1,7 +1,8 @@
 //! The trainer: runs the stages one after the other, one optimiser step a call, and keeps the run's folder.
 //!
 //! `RUN/config.toml` the resolved configuration · `log.jsonl` and TensorBoard's `events.*` a line every few steps ·
-//! `samples/` grids · `checkpoints/` all that is needed to continue · `model.safetensors` the result.
+//! `samples/` grids · `checkpoints/` all that is needed to continue, the newest few and the best · `model.safetensors`
+//! the result. Of processes that train together, the first keeps it.
 
 use std::{
     fs::OpenOptions,
@@ -27,6 +28,7 @@ use crate::{
         events::{Event, Metrics, StepReport},
         field_stage::FieldStage,
         portrait_codes::PortraitCodes,
+        team::Team,
         upsampler_stage::UpsamplerStage,
         warmup::Warmup,
     },
@@ -36,6 +38,11 @@ use crate::{
 pub trait StageRun {
     /// Does optimiser step number `step` (from 0) and says what was measured.
     fn step(&mut self, step: usize) -> Result<Metrics>;
+    /// What a step's metrics say of the error that training is to bring down; none where losses do not tell, as those
+    /// of adversaries.
+    fn error(&self, _metrics: &Metrics) -> Option<f64> {
+        None
+    }
     /// Everything that changes from step to step.
     fn save(&self, tensors: &mut Tensors) -> Result<()>;
     /// Takes back what [`Self::save`] gave.
@@ -85,6 +92,8 @@ pub struct Inputs {
     pub start: Option<Start>,
     /// Where to compute.
     pub device: Device,
+    /// The processes that train together.
+    pub team: Team,
 }
 
 /// Runs the stages of a configuration.
@@ -97,6 +106,8 @@ pub struct Trainer {
     current: Option<Current>,
     finished: Option<Start>,
     last_checkpoint: Option<PathBuf>,
+    /// Errors since the last checkpoint.
+    errors: Vec<f64>,
     /// Opened at the first step: a run that cannot begin leaves none.
     tensorboard: Option<EventFile>,
 }
@@ -110,14 +121,16 @@ struct Current {
 impl Trainer {
     /// A new run in the folder `run`, which must not hold one yet.
     pub fn new(config: TrainConfig, stage: Stage, inputs: Inputs, run: &Path) -> Result<Self> {
-        if run.join("config.toml").exists() {
+        if inputs.team.leads() && run.join("config.toml").exists() {
             return Err(Error::malformed(
                 run,
                 "holds a run already; pass --resume to continue it or choose another folder",
             ));
         }
         let trainer = Self::open(config, stage, inputs, run)?;
-        files::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
+        if trainer.inputs.team.leads() {
+            files::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
+        }
         Ok(trainer)
     }
 
@@ -148,7 +161,7 @@ impl Trainer {
     fn open(config: TrainConfig, stage: Stage, inputs: Inputs, run: &Path) -> Result<Self> {
         config.validate()?;
         let stages = stages(&config, stage)?;
-        let checkpoints = Checkpoints::of(run, 2);
+        let checkpoints = Checkpoints::of(run, config.keep_checkpoints);
         let (run, current, finished) = (run.to_owned(), None, None);
         Ok(Self {
             config,
@@ -159,6 +172,7 @@ impl Trainer {
             current,
             finished,
             last_checkpoint: None,
+            errors: Vec::new(),
             tensorboard: None,
         })
     }
@@ -188,18 +202,20 @@ impl Trainer {
         }
         current.step += 1;
         let step = current.step;
+        self.errors.extend(current.stage.error(&metrics));
         let before = self.steps_before(current.position);
         let report = StepReport { stage, step, total, seconds: began.elapsed().as_secs_f64(), metrics };
-        if step % self.config.log_steps == 0 || step == 1 || step == total {
+        let leads = self.inputs.team.leads();
+        if leads && (step % self.config.log_steps == 0 || step == 1 || step == total) {
             self.log(&report)?;
             events.extend(self.tell_tensorboard(step, |file| file.scalars(before + step, report.scalars())));
         }
         events.push(Event::Step(report));
-        if step % self.config.sample_steps == 0 || step == total {
+        if leads && (step % self.config.sample_steps == 0 || step == total) {
             events.extend(self.write_samples(&current, stage));
         }
         if step % self.config.checkpoint_steps == 0 || step == total {
-            events.push(Event::Checkpoint(self.write_checkpoint(&current)?));
+            events.extend(self.write_checkpoint(&current)?.map(Event::Checkpoint));
         }
         if step < total {
             self.current = Some(current);
@@ -209,24 +225,26 @@ impl Trainer {
         Ok(Some(events))
     }
 
-    /// Writes a checkpoint now, e.g. because the user wants to stop.
+    /// Writes a checkpoint now, e.g. because the user wants to stop; of a team, the leading process does.
     pub fn checkpoint(&mut self) -> Result<Option<PathBuf>> {
         let Some(current) = self.current.take() else { return Ok(None) };
         let path = self.write_checkpoint(&current);
         self.current = Some(current);
-        path.map(Some)
+        path
     }
 
     /// Ends a stage: the next one begins from its result, or the model is written.
     fn advance(&mut self, current: Current) -> Result<Vec<Event>> {
         let finished = current.stage.finished()?;
         let path = self.run.join("model.safetensors");
-        finished.save_codes(&self.run)?;
-        finished.generator.save(
-            &path,
-            &format!("{:?}", self.config.preset).to_lowercase(),
-            &self.provenance(current.position),
-        )?;
+        if self.inputs.team.leads() {
+            finished.save_codes(&self.run)?;
+            finished.generator.save(
+                &path,
+                &format!("{:?}", self.config.preset).to_lowercase(),
+                &self.provenance(current.position),
+            )?;
+        }
         let events = vec![Event::Model(path)];
         self.finished = Some(finished);
         if current.position + 1 < self.stages.len() {
@@ -237,12 +255,7 @@ impl Trainer {
 
     fn begin(&mut self, position: usize) -> Result<Current> {
         let start = self.finished.take().or_else(|| self.inputs.start.clone());
-        let start = start.as_ref();
-        let stage: Box<dyn StageRun> = match self.stages[position] {
-            Stage::Warmup => Box::new(Warmup::new(&self.config, &self.inputs, start)?),
-            Stage::Field => Box::new(FieldStage::new(&self.config, &self.inputs, start)?),
-            Stage::Upsampler | Stage::All => Box::new(UpsamplerStage::new(&self.config, &self.inputs, start)?),
-        };
+        let stage = begin(self.stages[position], &self.config, &self.inputs, start.as_ref())?;
         Ok(Current { position, step: 0, stage })
     }
 
@@ -269,14 +282,19 @@ impl Trainer {
         self.stages[..position].iter().map(|stage| steps(&self.config, *stage)).sum()
     }
 
-    fn write_checkpoint(&mut self, current: &Current) -> Result<PathBuf> {
+    fn write_checkpoint(&mut self, current: &Current) -> Result<Option<PathBuf>> {
+        let errors = std::mem::take(&mut self.errors);
+        if !self.inputs.team.leads() {
+            return Ok(None);
+        }
         let before = self.steps_before(current.position);
-        let header = CheckpointHeader { stage: self.stages[current.position], step: current.step };
+        let error = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64);
+        let header = CheckpointHeader { stage: self.stages[current.position], step: current.step, error };
         let mut tensors = Tensors::new();
         current.stage.save(&mut tensors)?;
         let path = self.checkpoints.write(before + current.step, &header, &tensors)?;
         self.last_checkpoint = Some(path.clone());
-        Ok(path)
+        Ok(Some(path))
     }
 
     /// A failed preview must not end hours of training.
@@ -335,8 +353,22 @@ impl Trainer {
     }
 }
 
+/// A stage before its first step.
+pub(super) fn begin(
+    stage: Stage,
+    config: &TrainConfig,
+    inputs: &Inputs,
+    start: Option<&Start>,
+) -> Result<Box<dyn StageRun>> {
+    Ok(match stage {
+        Stage::Warmup => Box::new(Warmup::new(config, inputs, start)?),
+        Stage::Field => Box::new(FieldStage::new(config, inputs, start)?),
+        Stage::Upsampler | Stage::All => Box::new(UpsamplerStage::new(config, inputs, start)?),
+    })
+}
+
 /// The stages a run consists of; `all` takes those that the configuration gives steps.
-fn stages(config: &TrainConfig, stage: Stage) -> Result<Vec<Stage>> {
+pub(super) fn stages(config: &TrainConfig, stage: Stage) -> Result<Vec<Stage>> {
     let stages = match stage {
         Stage::All => [Stage::Warmup, Stage::Field, Stage::Upsampler]
             .into_iter()

@@ -36,6 +36,8 @@ use crate::{
         losses,
         optimiser::{Adam, Betas, Group},
         preview,
+        team::Team,
+        texture::texture,
         trainer::{Inputs, StageRun, Start},
     },
 };
@@ -59,6 +61,7 @@ pub struct UpsamplerStage {
     config: UpsamplerStageConfig,
     seed: u64,
     device: Device,
+    team: Team,
     generator: Generator,
     average: Average,
     perceptual: Option<Perceptual>,
@@ -113,12 +116,12 @@ impl UpsamplerStage {
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
         let variables = generator.parameters().within("upsampler").variables();
         let group = Group { variables, learning_rate: stage.learning_rate, largest_gradient_norm: None };
-        let optimiser = Adam::new(vec![group], betas);
-        if stage.perceptual > 0.0 && inputs.perceptual.is_none() {
-            let reason = "needs LPIPS weights; pass --lpips FILE, or --set upsampler.perceptual=0";
+        let optimiser = Adam::new(vec![group], betas).in_team(&inputs.team);
+        if (stage.perceptual > 0.0 || stage.texture > 0.0) && inputs.perceptual.is_none() {
+            let reason = "needs LPIPS weights; pass --lpips FILE, or --set upsampler.perceptual=0 upsampler.texture=0";
             return Err(Error::config("upsampler.perceptual", reason));
         }
-        let pairs = (stage.pixels > 0.0 || stage.perceptual > 0.0)
+        let pairs = (stage.pixels > 0.0 || stage.perceptual > 0.0 || stage.texture > 0.0)
             .then(|| Pairs::new(config, inputs, start.portrait_codes.as_ref(), resolution))
             .transpose()?;
         let adversary = (stage.adversarial > 0.0)
@@ -133,13 +136,17 @@ impl UpsamplerStage {
             return Err(Error::config("upsampler.random_portraits", "must be at least 1 where there are no pairs"));
         }
         if stage.agreement > 0.0 && stage.random_portraits == 0 {
-            return Err(Error::config("upsampler.agreement", "compares random portraits; set upsampler.random_portraits"));
+            return Err(Error::config(
+                "upsampler.agreement",
+                "compares random portraits; set upsampler.random_portraits",
+            ));
         }
         Ok(Self {
             average: Average::of(&generator.parameters().within("upsampler"), stage.average_half_life_images)?,
             config: stage,
             seed: config.seed,
             device: inputs.device.clone(),
+            team: inputs.team.clone(),
             generator,
             perceptual: inputs.perceptual.clone(),
             optimiser,
@@ -160,7 +167,7 @@ impl UpsamplerStage {
         let pixels = (losses::colour_l1(&output.rgb, &batch.photo)? * 2.0)?;
         metrics.push_loss("pixels", &pixels)?;
         let mut loss = (&pixels * config.pixels)?;
-        if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0) {
+        if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0 || config.texture > 0.0) {
             let [x, y] = [random.below(LARGEST_SHIFT + 1), random.below(LARGEST_SHIFT + 1)];
             let side = batch.photo.dim(2)? - LARGEST_SHIFT;
             let zoom = f64::from(random.range(1.0, config.perceptual_zoom as f32));
@@ -169,9 +176,16 @@ impl UpsamplerStage {
                 let crop = picture.narrow(2, y, side)?.narrow(3, x, side)?.contiguous()?;
                 Ok(enlarged.broadcast_matmul(&crop)?.broadcast_matmul(&enlarged.t()?)?)
             };
-            let distance = perceptual.distance(&view(&output.rgb)?, &view(&batch.photo)?)?.mean_all()?;
+            let found = perceptual.features(&view(&output.rgb)?)?;
+            let expected = perceptual.features(&view(&batch.photo)?)?;
+            let distance = perceptual.feature_distance(&found, &expected)?.mean_all()?;
             metrics.push_loss("perceptual", &distance)?;
             loss = (loss + (distance * config.perceptual)?)?;
+            if let Some((found, expected)) = found.first().zip(expected.first()).filter(|_| config.texture > 0.0) {
+                let difference = texture(found, expected)?;
+                metrics.push_loss("texture", &difference)?;
+                loss = (loss + (difference * config.texture)?)?;
+            }
         }
         let real = Judged { image: batch.photo, masks: batch.masks };
         let fake = Judged { image: output.rgb, masks: output.masks };
@@ -244,12 +258,14 @@ impl UpsamplerStage {
         let direction = (random.normal_tensor(output.rgb.dims(), &self.device)? / pixels.sqrt())?;
         let path = PathLength::new(&network.latent_gradient(&trace, &direction)?, &self.path_mean, PATH_DECAY)?;
         metrics.push_loss("path_length", &path.penalty)?;
-        self.path_mean = path.mean;
+        self.path_mean = self.team.mean(&path.mean)?;
         Ok(Some((path.penalty * (config.path_length * every as f64))?))
     }
 
-    /// Renders of random portraits from `views` random cameras each; the field gets no gradient.
+    /// Renders of `people` random portraits from `views` random cameras each; the field gets no gradient.
     fn random_renders(&self, people: usize, views: usize, random: &mut Stream) -> Result<RandomRenders> {
+        let share = self.team.share();
+        let people = share.whole(people);
         let z = random.normal_tensor(&[people, self.generator.config().field.style_dim], &self.device)?;
         let codes = codes::broadcast(&self.generator.map(&self.generator.spread(&z)?)?.detach())?;
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
@@ -261,7 +277,11 @@ impl UpsamplerStage {
                 cameras.push(agreement::turned(first, self.config.agreement_turn_rad, random));
             }
         }
-        let rows: Vec<u32> = (0..people * views).map(|index| (index / views) as u32).collect();
+        let people = share.rows(people);
+        let views_of = |person: &usize| person * views..(person + 1) * views;
+        let cameras: Vec<Camera> =
+            people.iter().filter_map(|person| cameras.get(views_of(person))).flatten().copied().collect();
+        let rows: Vec<u32> = people.iter().flat_map(|person| vec![*person as u32; views]).collect();
         let codes = codes.index_select(&Tensor::new(rows, &self.device)?, 0)?;
         let parameters = Camera::parameter_tensor(&cameras, &self.device)?;
         let frame = self.generator.render(&codes, &parameters, &pairs::settings(&self.generator))?;
@@ -286,8 +306,14 @@ impl StageRun for UpsamplerStage {
         let factor = self.config.schedule.factor(step, self.config.steps);
         let norms = self.optimiser.step(&total.backward()?, factor)?;
         metrics.push("gradient_norm", norms.iter().sum());
-        self.average.update(&self.generator.parameters().within("upsampler"), self.config.batch)?;
+        let images = self.team.share().whole(self.config.batch);
+        self.average.update(&self.generator.parameters().within("upsampler"), images)?;
         Ok(metrics)
+    }
+
+    fn error(&self, metrics: &Metrics) -> Option<f64> {
+        let perceptual = metrics.get("perceptual").unwrap_or_default();
+        Some(self.config.pixels * metrics.get("pixels")? + self.config.perceptual * perceptual)
     }
 
     fn save(&self, tensors: &mut Tensors) -> Result<()> {
@@ -377,7 +403,13 @@ mod tests {
                 offsets: None,
             }),
         };
-        let inputs = Inputs { dataset: Arc::clone(portraits), perceptual: None, start: None, device: Device::Cpu };
+        let inputs = Inputs {
+            dataset: Arc::clone(portraits),
+            perceptual: None,
+            start: None,
+            device: Device::Cpu,
+            team: Team::default(),
+        };
         UpsamplerStage::new(&config, &inputs, Some(&start)).unwrap()
     }
 

@@ -25,6 +25,7 @@ use crate::{
         optimiser::{Adam, Betas, Group},
         portrait_codes::{PortraitCodes, RowTable},
         preview,
+        team::Team,
         trainer::{Inputs, StageRun, Start},
         whiten::whiten,
     },
@@ -52,6 +53,7 @@ pub struct Warmup {
     config: WarmupConfig,
     seed: u64,
     device: Device,
+    team: Team,
     portraits: Cached,
     mirror: bool,
     generator: Generator,
@@ -114,11 +116,13 @@ impl Warmup {
             group(vec![(CODES.to_owned(), codes.clone())], stage.code_learning_rate, None),
         ];
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
-        let optimiser = Adam::new(groups, betas);
+        let optimiser = Adam::new(groups, betas).in_team(&inputs.team);
+        inputs.team.portraits(stage.batch, all.len())?;
         Ok(Self {
             config: stage,
             seed: config.seed,
             device: inputs.device.clone(),
+            team: inputs.team.clone(),
             portraits,
             mirror: config.mirror,
             generator,
@@ -141,15 +145,22 @@ impl Warmup {
         let level = self.portraits.level(resolution)?;
         let all = draws(self.portraits.len(), self.mirror);
         let order = random.permutation(all.len());
-        let batch = config.batch.min(all.len());
+        let share = self.team.share();
+        let whole: Vec<u32> =
+            order.into_iter().take(self.team.portraits(config.batch, all.len())?).map(|row| row as u32).collect();
+        let own = share.rows(whole.len());
+        let batch = own.len();
         let rays = config.rays.min(resolution * resolution);
 
         let (mut pixels, mut colours, mut masks) = (Vec::new(), Vec::new(), Vec::new());
         let (mut cameras, mut rows) = (Vec::new(), Vec::new());
-        for row in order.into_iter().take(batch) {
-            let draw = all[row];
-            rows.push(row as u32);
-            cameras.push(self.portraits.camera(draw).unwrap_or_default());
+        for (place, row) in whole.iter().enumerate() {
+            let draw = all[*row as usize];
+            let is_own = own.contains(&place);
+            if is_own {
+                rows.push(*row);
+                cameras.push(self.portraits.camera(draw).unwrap_or_default());
+            }
             // Weighted draws without replacement: the largest u^(1/w) win (Efraimidis and Spirakis, 2006).
             let mut keys: Vec<(f32, usize)> = Vec::with_capacity(resolution * resolution);
             for pixel in 0..resolution * resolution {
@@ -162,12 +173,18 @@ impl Warmup {
             }
             keys.select_nth_unstable_by(rays - 1, |left, right| right.0.total_cmp(&left.0));
             let start = masks.len();
-            masks.resize(start + REGION_COUNT * rays, 0.0);
+            if is_own {
+                masks.resize(start + REGION_COUNT * rays, 0.0);
+            }
             for (ray, (_, pixel)) in keys.iter().take(rays).enumerate() {
                 let (x, y) = (pixel % resolution, pixel / resolution);
                 let jitter = config.pixel_jitter as f32;
-                pixels.push(x as f32 + 0.5 + random.range(-jitter, jitter));
-                pixels.push(y as f32 + 0.5 + random.range(-jitter, jitter));
+                let [shift_x, shift_y] = [random.range(-jitter, jitter), random.range(-jitter, jitter)];
+                if !is_own {
+                    continue;
+                }
+                pixels.push(x as f32 + 0.5 + shift_x);
+                pixels.push(y as f32 + 0.5 + shift_y);
                 let (colour, shares) = level.pixel(draw, x, y).unwrap_or_default();
                 colours.extend(colour.map(signed));
                 for (region, share) in shares.into_iter().enumerate() {
@@ -184,7 +201,7 @@ impl Warmup {
                 .filter(|_| progress >= config.region_codes_from)
                 .map(|table| table.gather(&rows, device))
                 .transpose()?,
-            row_numbers: rows.clone(),
+            whole_rows: whole,
             rows: Tensor::from_vec(rows, batch, device)?,
             cameras: Camera::parameter_tensor(&cameras, device)?,
             pixels: Tensor::from_vec(pixels, (batch, rays, 2), device)?,
@@ -207,7 +224,10 @@ impl Warmup {
         let bundle = RayBundle::new(rays)?;
         let sampling = self.sampling();
         let (count, ray_count) = bundle.dimensions()?;
-        let depths = sampling.perturbed(count, ray_count, &mut batch.random, DType::F32, &self.device)?;
+        let share = self.team.share();
+        let whole = share.whole(count);
+        let depths = sampling.perturbed(whole, ray_count, &mut batch.random, DType::F32, &self.device)?;
+        let depths = share.of(&depths)?;
         let outputs = Outputs { colour: true, ..Outputs::default() };
         let output = render_rays(&field, &bundle, &depths, &sampling, outputs, RegionSet::ALL)?;
 
@@ -263,7 +283,8 @@ impl Warmup {
         let count = ((available as f64 * self.config.eikonal_share) as usize).clamp(1, available);
         let chosen: Vec<u32> = (0..count).map(|_| batch.random.below(available) as u32).collect();
         let chosen = points.detach().index_select(&Tensor::from_vec(chosen, count, &self.device)?, 1)?;
-        let noise = batch.random.normal_tensor(&[portraits, count, 3], &self.device)?;
+        let share = self.team.share();
+        let noise = share.of(&batch.random.normal_tensor(&[share.whole(portraits), count, 3], &self.device)?)?;
         Ok((chosen + (noise * EIKONAL_SPREAD)?)?)
     }
 
@@ -295,7 +316,8 @@ impl Warmup {
 struct Batch {
     resolution: usize,
     rows: Tensor,
-    row_numbers: Vec<u32>,
+    /// Rows of the codes that the whole team's step takes; `rows` are this process's.
+    whole_rows: Vec<u32>,
     /// The rows' share of the table, to differentiate by: `[B, 9, 2, D]`.
     region_codes: Option<Var>,
     cameras: Tensor,
@@ -323,10 +345,15 @@ impl StageRun for Warmup {
         if let (Some(table), Some(gathered)) = (&mut self.region_codes, &batch.region_codes)
             && let Some(gradient) = gradients.get(gathered)
         {
-            table.step(&batch.row_numbers, gradient, self.config.region_code_learning_rate * factor, self.betas)?;
+            let gradient = self.team.gather(gradient)?;
+            table.step(&batch.whole_rows, &gradient, self.config.region_code_learning_rate * factor, self.betas)?;
         }
         metrics.push("gradient_norm", norms.first().copied().unwrap_or(0.0));
         Ok(metrics)
+    }
+
+    fn error(&self, metrics: &Metrics) -> Option<f64> {
+        metrics.get("colour")
     }
 
     fn save(&self, tensors: &mut Tensors) -> Result<()> {
@@ -421,7 +448,13 @@ mod tests {
     fn stage(folder: &std::path::Path) -> Warmup {
         let mut config = TrainConfig::preset(Preset::Tiny);
         config.model.field.style_dim = 6;
-        let inputs = Inputs { dataset: dataset(folder, 9), perceptual: None, start: None, device: Device::Cpu };
+        let inputs = Inputs {
+            dataset: dataset(folder, 9),
+            perceptual: None,
+            start: None,
+            device: Device::Cpu,
+            team: Team::default(),
+        };
         Warmup::new(&config, &inputs, None).unwrap()
     }
 

@@ -84,6 +84,7 @@ impl Adversary {
                     batch: stage.batch,
                     mirror: config.mirror,
                     seed: config.seed,
+                    share: inputs.team.share(),
                     ..LoaderConfig::default()
                 };
                 let source = (Arc::clone(&inputs.dataset), loader);
@@ -96,7 +97,7 @@ impl Adversary {
             learning_rate: stage.discriminator_learning_rate,
             largest_gradient_norm: None,
         };
-        Ok(Self { optimiser: Adam::new(vec![group], betas), discriminator, parameters, photos })
+        Ok(Self { optimiser: Adam::new(vec![group], betas).in_team(&inputs.team), discriminator, parameters, photos })
     }
 
     /// The photos of a step, for a run without pairs.

@@ -28,7 +28,8 @@ pub(super) fn turned(camera: Camera, largest_turn_rad: f64, random: &mut Stream)
 /// `pictures` is `[VIEWS · people, 3, S, S]`, a person's views in a row; none if no pair shows a common surface.
 pub(super) fn disagreement(pictures: &Tensor, frame: &Frame, cameras: &[Camera]) -> Result<Option<Tensor>> {
     let side = pictures.dim(2)?;
-    let surface = |index: usize| Surface::new(cameras[index], &frame.try_map(|picture| Ok(picture.narrow(0, index, 1)?))?);
+    let surface =
+        |index: usize| Surface::new(cameras[index], &frame.try_map(|picture| Ok(picture.narrow(0, index, 1)?))?);
     let mut differences = Vec::new();
     for first in (0..cameras.len() / VIEWS).map(|person| VIEWS * person) {
         let surfaces = [surface(first)?, surface(first + 1)?];

@@ -10,7 +10,7 @@ use crate::{
     region::REGION_COUNT,
     render::{Frame, RenderSettings, TwoPass},
     rng::Stream,
-    train::{config::TrainConfig, portrait_codes::PortraitCodes, trainer::Inputs},
+    train::{config::TrainConfig, portrait_codes::PortraitCodes, team::Team, trainer::Inputs},
 };
 
 /// Renders of training portraits are kept up to this many; beyond it they are rendered each time they are needed.
@@ -23,6 +23,7 @@ pub(super) struct Pairs {
     codes: PortraitCodes,
     renders: Vec<Option<Render>>,
     kept: usize,
+    team: Team,
 }
 
 /// A square of the renders of some portraits, and the same square of their photos.
@@ -84,7 +85,7 @@ impl Pairs {
         })?;
         let portraits = Cached::new(&inputs.dataset, &[resolution], &|_| ())?;
         let renders = vec![None; draws.len()];
-        Ok(Self { portraits, draws, codes: codes.clone(), renders, kept: 0 })
+        Ok(Self { portraits, draws, codes: codes.clone(), renders, kept: 0, team: inputs.team.clone() })
     }
 
     /// The codes of all portraits.
@@ -112,7 +113,8 @@ impl Pairs {
         let (device, resolution) = (generator.device(), generator.output_resolution());
         let factor = resolution / generator.render_resolution();
         let rows = random.permutation(self.draws.len());
-        let rows = &rows[..count.min(rows.len())];
+        let whole = self.team.portraits(count, rows.len())?;
+        let rows = self.team.share().pick(&rows[..whole]);
         let square = Square::random(crop, generator.render_resolution(), random);
         let renders = rows.iter().map(|row| self.render(generator, *row)).collect::<Result<Vec<_>>>()?;
         let draws: Vec<Draw> = rows.iter().map(|row| self.draws[*row]).collect();
