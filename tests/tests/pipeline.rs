@@ -128,6 +128,38 @@ fn a_killed_training_run_resumes_to_the_same_model() {
     assert!(folder.read("halves/model.safetensors") == folder.read("whole/model.safetensors"), "the models differ");
 }
 
+#[test]
+fn a_dry_run_tells_configuration_time_and_memory_and_writes_nothing() {
+    let folder = Folder::with_model("dry_run");
+    let told = folder.json(&format!("train --data {DATA} --out run --preset tiny --dry-run"));
+    assert_eq!(told["not_estimated"], serde_json::json!([]));
+    let estimates = told["estimates"].as_array().unwrap();
+    assert!(!estimates.is_empty());
+    for estimate in estimates {
+        assert!(number(estimate, "seconds") > 0.0 && number(estimate, "memory_bytes") > 1e6, "{estimate}");
+    }
+    // The paper's settings; its networks are too large to try out in a test, and a stage of no steps is not tried.
+    let off = "--set field.steps=1 --set upsampler.steps=0 --set field.resolution=8 --set field.samples=2";
+    let told = folder.json(&format!("train --data {DATA} --out run --preset ffhq {off} --dry-run"));
+    let (config, field) = (&told["config"], &told["config"]["field"]);
+    assert_eq!(number(&config["model"]["field"], "width"), 128.0);
+    assert_eq!(number(&config["model"]["field"], "style_dim"), 256.0);
+    assert_eq!((number(field, "generator_learning_rate"), number(field, "discriminator_learning_rate")), (2e-5, 2e-4));
+    assert_eq!((number(field, "view"), number(field, "eikonal"), number(field, "minimal_surface")), (15.0, 0.1, 0.001));
+    assert!(!folder.path("run").exists());
+}
+
+#[test]
+fn several_processes_without_mpi_are_refused() {
+    let folder = Folder::with_model("processes");
+    let mut training = folder.command(&format!("train --data {DATA} --out run --preset tiny"));
+    let ended = training.env("OMPI_COMM_WORLD_SIZE", "2").stderr(std::process::Stdio::piped()).output().unwrap();
+    assert_eq!(ended.status.code(), Some(2));
+    let said = String::from_utf8(ended.stderr).unwrap();
+    assert!(said.contains("--features mpi") && said.lines().count() == 1, "{said}");
+    assert!(!folder.path("run").exists());
+}
+
 #[cfg(unix)]
 #[test]
 fn ctrl_c_ends_training_with_a_checkpoint_and_the_line_that_goes_on() {

@@ -13,11 +13,11 @@ use crate::{
     },
 };
 
-/// Portraits of the step that is measured; both numbers are scaled from it to the batch.
-const MEASURED_BATCH: usize = 2;
+/// Number of the step that is measured: the first would have every periodic penalty.
+const MEASURED_STEP: usize = 1;
 
-/// What a stage will cost on this machine. Steps are measured with two portraits and scaled by the batch, so that even
-/// settings for a large machine are estimated in a minute; periodic penalties (path length, lazy R1) are not in them.
+/// What a stage will cost on this machine: a step with one portrait is measured and scaled by the batch, so that even
+/// settings for a large machine are estimated in a minute. Periodic penalties (path length, lazy R1) are not in it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Estimate {
     /// The stage.
@@ -53,19 +53,17 @@ pub fn estimate(config: &TrainConfig, stage: Stage, inputs: &Inputs) -> Result<V
 fn of_stage(config: &TrainConfig, stage: Stage, inputs: &Inputs, start: Option<&Start>) -> Result<(Estimate, Start)> {
     let mut small = config.clone();
     let batches = [&mut small.warmup.batch, &mut small.field.batch, &mut small.upsampler.batch];
-    batches.into_iter().for_each(|batch| *batch = (*batch).min(MEASURED_BATCH));
+    batches.into_iter().for_each(|batch| *batch = 1);
     let batch = |config: &TrainConfig| match stage {
         Stage::Warmup => config.warmup.batch,
         Stage::Field => config.field.batch,
         Stage::Upsampler | Stage::All => config.upsampler.batch,
     };
-    let scale = batch(config) as f64 / batch(&small).max(1) as f64;
+    let scale = batch(config) as f64;
     let mut run = begin(stage, &small, inputs, start)?;
     let before = peak_rss_bytes();
-    // The first step allocates what the others use again, and has all periodic penalties.
-    run.step(0)?;
     let began = Instant::now();
-    run.step(1)?;
+    run.step(MEASURED_STEP)?;
     let seconds_a_step = began.elapsed().as_secs_f64() * scale;
     let memory_bytes =
         before.zip(peak_rss_bytes()).map(|(before, after)| before + ((after - before) as f64 * scale) as u64);
@@ -88,7 +86,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut config = TrainConfig::preset(Preset::Tiny);
         config.field.steps = 3;
-        let dataset = dataset(folder.path(), 4);
+        let dataset = dataset(folder.path(), 9);
         let inputs = Inputs {
             dataset: Arc::clone(&dataset),
             perceptual: None,
