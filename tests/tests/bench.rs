@@ -58,7 +58,7 @@ fn convolutions_are_compared_to_candle() {
 #[test]
 fn training_steps_have_speed_memory_and_exact_gradients() {
     let folder = Folder::new("train");
-    let report = bench(&folder, "train --config tiny --repeats 1 --steps pivot,training", "out");
+    let report = bench(&folder, "train --config tiny --repeats 1 --batch 1 --steps pivot,training", "out");
     assert_positive(&report, &["plain_seconds_per_image", "fused_seconds_per_image"]);
     assert!(number(&report, "gradient_rel_error") < 1e-4);
     if cfg!(target_os = "linux") {

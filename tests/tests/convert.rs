@@ -32,6 +32,8 @@ fn converts(name: &str, stage: &str, size: u32) {
     assert_eq!(info["parameters"], converted["parameters"]);
     assert_eq!(number(&info, "output_resolution"), f64::from(size));
     assert_eq!(info["config"]["upsampler"].is_object(), stage == "full");
+    let raw = folder.json("convert authors.pt --raw --out raw.safetensors");
+    assert!(raw["hash"] != converted["hash"], "the weights and their moving average are two things");
     fs::create_dir(folder.path("random")).unwrap();
     folder.run("generate --model model.safetensors --seeds 0 --out random").done();
     let picture = folder.picture("random/seed0000.png");

@@ -13,9 +13,6 @@ use crate::{
     },
 };
 
-/// Number of the step that is measured: the first would have every periodic penalty.
-const MEASURED_STEP: usize = 1;
-
 /// What a stage will cost on this machine: a step with one portrait is measured and scaled by the batch, so that even
 /// settings for a large machine are estimated in a minute. Periodic penalties (path length, lazy R1) are not in it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -63,7 +60,8 @@ fn of_stage(config: &TrainConfig, stage: Stage, inputs: &Inputs, start: Option<&
     let mut run = begin(stage, &small, inputs, start)?;
     let before = peak_rss_bytes();
     let began = Instant::now();
-    run.step(MEASURED_STEP)?;
+    // The first step would have every periodic penalty, and a discriminator may run ahead alone.
+    run.step(1 + config.upsampler.discriminator_ahead_steps)?;
     let seconds_a_step = began.elapsed().as_secs_f64() * scale;
     let memory_bytes =
         before.zip(peak_rss_bytes()).map(|(before, after)| before + ((after - before) as f64 * scale) as u64);

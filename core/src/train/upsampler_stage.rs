@@ -300,8 +300,12 @@ impl StageRun for UpsamplerStage {
         let adversarial = self.adversarial_loss(step, pictures, random.judged, &mut metrics)?;
         let losses = [paired_loss, random.loss, adversarial, self.path_length(step, &mut metrics)?];
         let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
-        let total =
-            total.ok_or_else(|| Error::config("upsampler", "every loss has weight 0; there is nothing to train"))??;
+        let total = match total {
+            Some(total) => total?,
+            // The discriminator still runs ahead, and there is nothing else to learn from.
+            None if self.adversary.is_some() => return Ok(metrics),
+            None => return Err(Error::config("upsampler", "every loss has weight 0; there is nothing to train")),
+        };
         metrics.check_finite()?;
         let factor = self.config.schedule.factor(step, self.config.steps);
         let norms = self.optimiser.step(&total.backward()?, factor)?;
@@ -426,7 +430,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let portraits = dataset(folder.path(), 4);
         let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
-        let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=0", "random_portraits=2"];
+        let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=1", "random_portraits=2"];
         let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
         for (settings, quantities) in [
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
