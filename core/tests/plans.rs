@@ -186,6 +186,19 @@ fn errors_stay_within_the_reported_bound_and_the_bound_within_the_budget() {
     }
 }
 
+/// Space is proven empty by some of the regions alone, whether a session has known the others or not.
+#[test]
+fn empty_space_costs_few_shape_branches() {
+    // Residuals as small as trained ones, so that the sphere's surroundings are empty.
+    let form = FieldConfig { residual_scale: 0.02, alpha_initial: 0.001, ..forms().remove(0) };
+    let (field, camera) = (field(&form, &codes(1, 1), 4), cameras(&[Camera::at(0.3, 0.1)]));
+    let exact = render(&field, &camera, &settings(&form, 0.0)).unwrap().frame;
+    let Planned { frame, report } = render(&field, &camera, &settings(&form, 2e-3)).unwrap();
+    assert!(colour_error(&frame, &exact) <= report.bound && report.bound <= 2e-3, "{report:?}");
+    assert!(report.samples_evaluated < report.samples / 2, "{report:?}");
+    assert!(report.shape_pairs_evaluated < 4 * report.samples, "{report:?}");
+}
+
 #[test]
 fn a_tiny_budget_differs_by_rounding_alone() {
     for (seed, form) in forms().iter().enumerate() {

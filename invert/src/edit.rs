@@ -16,6 +16,7 @@ use cnerf_core::{
     eval::locality::EditChange,
     model::generator::{Generator, Picture},
     region::{REGION_COUNT, Region, RegionSet},
+    render::plan::FrameReport,
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -101,6 +102,9 @@ pub struct Edited {
     pub regions: RgbImage,
     /// How far the last [`Goal::Colour`]'s region ended from its colour, see [`perceived_difference`].
     pub colour_difference: Option<f64>,
+    /// How the last picture was rendered, what it had in common with the one before left alone; none if it was rendered
+    /// whole.
+    pub rerendered: Option<FrameReport>,
 }
 
 impl Goal {
@@ -187,8 +191,10 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
     }
     let mut opened = Opened::new(portrait, path, model)?;
     let camera = portrait.camera;
-    let first = opened.picture(&camera)?;
+    let mut session = opened.session(&camera)?;
+    let (first, _) = opened.picture_in(&mut session)?;
     let mut before = first.clone();
+    let mut rerendered = None;
     let mut history = Vec::with_capacity(edits.len());
     let mut all = RegionSet::EMPTY;
     let mut colour_difference = None;
@@ -209,7 +215,8 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
         let tint = blended_tint(&tint, &other, &edit)?;
         opened.set_tint(&tint)?;
         kept_tint = (tint.abs()?.sum_all()?.to_scalar::<f32>()? > 0.0).then_some(tint);
-        let after = opened.picture(&camera)?;
+        let (after, report) = opened.picture_in(&mut session)?;
+        rerendered = Some(report);
         let change = measure(&before, &after, edit.regions)?;
         if let Goal::Colour(colour) = goal {
             colour_difference = farthest_from(*colour, &opened, &camera, regions)?;
@@ -218,7 +225,7 @@ pub fn apply(portrait: &mut Portrait, path: &Path, model: &Generator, edits: &[(
         all = all.union(regions);
         before = after;
     }
-    let edited = Edited { colour_difference, ..compare(&first, &before, all)? };
+    let edited = Edited { colour_difference, rerendered, ..compare(&first, &before, all)? };
     portrait.thumbnail = thumbnail(portrait, &edited.after)?;
     portrait.codes = opened.codes.squeeze(0)?;
     portrait.tint = kept_tint;
@@ -256,6 +263,7 @@ fn compare(before: &Picture, after: &Picture, regions: RegionSet) -> Result<Edit
         after: one_picture(&after.rgb)?,
         regions: LabelMap::from_masks(&after.masks.squeeze(0)?)?.colours(),
         colour_difference: None,
+        rerendered: None,
     })
 }
 

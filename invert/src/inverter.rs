@@ -18,6 +18,10 @@ use cnerf_core::{
         file::{self, Tensors},
         generator::{Generator, Picture},
     },
+    render::{
+        RadianceField as _,
+        plan::{FrameReport, Planned, Session},
+    },
 };
 use image::{Luma, RgbImage};
 
@@ -383,6 +387,21 @@ impl Opened {
     pub fn picture(&self, camera: &Camera) -> Result<Picture> {
         let view = Camera::parameter_tensor(&[*camera], &self.generator.device())?;
         whole_picture(&self.generator, &self.codes, self.global.as_ref(), &view, false)
+    }
+
+    /// A session of the view from `camera`, to render edits in.
+    pub(crate) fn session(&self, camera: &Camera) -> Result<Session> {
+        let view = Camera::parameter_tensor(&[*camera], &self.generator.device())?;
+        Ok(Session::new(&view, &self.generator.render_settings())?)
+    }
+
+    /// The finished picture of the session's view, as [`Self::picture`]: only what changed since the session's last one is
+    /// evaluated. And how much that was.
+    pub(crate) fn picture_in(&self, session: &mut Session) -> Result<(Picture, FrameReport)> {
+        let field = self.generator.field().portraits(&self.codes)?.detached();
+        let Planned { frame, report } = session.render(&field)?;
+        let lifted = self.generator.upsample(&frame, &self.codes, self.global.as_ref())?;
+        Ok((Picture { rgb: lifted.rgb.detach(), masks: lifted.masks.detach(), frame }, report))
     }
 }
 

@@ -10,6 +10,7 @@ use cnerf_core::{
     interop::sheet::Sheet,
     model::generator::Generator,
     region::{Region, RegionSet},
+    render::plan::FrameReport,
 };
 use cnerf_invert::{
     edit::{self, Change, Colour, Edit, Edited, Goal, Source},
@@ -92,6 +93,8 @@ struct Report {
     change: Change,
     #[serde(skip_serializing_if = "Option::is_none")]
     colour_difference: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    rerendered: Option<FrameReport>,
     seconds: f64,
 }
 
@@ -160,6 +163,7 @@ impl EditArguments {
             picture: sheet.to_owned(),
             change: edited.change,
             colour_difference: edited.colour_difference,
+            rerendered: edited.rerendered,
             seconds: began.elapsed().as_secs_f64(),
         };
         console.result(&report, || format!("{}: {}", report.output.display(), say(&report)))?;

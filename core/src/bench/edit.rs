@@ -157,12 +157,5 @@ pub fn chart(report: &Report) -> Result<String> {
         ],
     };
     let groups: Vec<_> = report.edits.iter().map(group).collect();
-    GroupedBars {
-        title: &title,
-        subtitle: &subtitle,
-        unit: "seconds a frame; shorter is faster",
-        groups: &groups,
-        limits: &[],
-    }
-    .svg()
+    GroupedBars::seconds_a_frame(&title, &subtitle, &groups).svg()
 }

@@ -285,14 +285,7 @@ pub fn charts(report: &Report) -> Result<Vec<(&'static str, String)>> {
         Group { label: "within a budget".into(), bars: budgets.collect() },
     ];
     let groups: Vec<_> = groups.into_iter().filter(|group| !group.bars.is_empty()).collect();
-    let paths = GroupedBars {
-        title: "A frame on every path",
-        subtitle: &subtitle,
-        unit: "seconds; shorter is faster",
-        groups: &groups,
-        limits: &[],
-    }
-    .svg()?;
+    let paths = GroupedBars::seconds_a_frame("A frame on every path", &subtitle, &groups).svg()?;
 
     let curve = |name: &str, value: &dyn Fn(&BudgetReport) -> f64| {
         let mut points: Vec<_> = report.budgeted.iter().map(|budget| (budget.seconds, value(budget))).collect();

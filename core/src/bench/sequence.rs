@@ -139,12 +139,5 @@ pub fn chart(report: &Report) -> Result<String> {
         ("over shared geometry, its making included".to_owned(), report.shared_seconds_per_frame),
     ];
     let groups = [Group { label: format!("a frame ({})", report.path), bars }];
-    GroupedBars {
-        title: &title,
-        subtitle: &subtitle,
-        unit: "seconds a frame; shorter is faster",
-        groups: &groups,
-        limits: &[],
-    }
-    .svg()
+    GroupedBars::seconds_a_frame(&title, &subtitle, &groups).svg()
 }

@@ -2,7 +2,8 @@
 //! need").
 //!
 //! A plan runs in stages over chunks of rays. The shape branches come first, front to back, and end a ray where what is
-//! left of its light cannot matter ([`march`]). That fixes how much of its pixel every (sample, region) pair can change;
+//! left of its light cannot matter; space that the branches of some regions already prove empty costs no others
+//! ([`march`]). That fixes how much of its pixel every (sample, region) pair can change;
 //! texture branches run only for pairs whose largest possible effects, summed over what is left out, would not stay
 //! within the budget ([`select`], which has the proof). What is left out counts as the middle of what it could be.
 //!
@@ -51,10 +52,12 @@ use crate::{
     render::{Frame, RadianceField, RayBundle, RenderSettings, frame},
 };
 
+mod features;
 mod grid;
 mod local;
 mod march;
 mod rays;
+mod reach;
 mod select;
 mod sequence;
 mod session;
@@ -62,7 +65,8 @@ mod shade;
 mod state;
 mod whole;
 
-pub use local::{LocalFeatures, LocalField, LocalInitial, LocalWeights};
+pub use features::LocalFeatures;
+pub use local::{LocalField, LocalInitial, LocalWeights};
 pub use sequence::Sequence;
 pub use session::Session;
 

@@ -33,7 +33,12 @@ pub struct GroupedBars<'a> {
     pub limits: &'a [(String, f64)],
 }
 
-impl GroupedBars<'_> {
+impl<'a> GroupedBars<'a> {
+    /// Seconds a frame.
+    pub fn seconds_a_frame(title: &'a str, subtitle: &'a str, groups: &'a [Group]) -> Self {
+        Self { title, subtitle, unit: "seconds a frame; shorter is faster", groups, limits: &[] }
+    }
+
     /// The chart as SVG.
     ///
     /// # Errors

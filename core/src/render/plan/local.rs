@@ -1,7 +1,9 @@
 //! A field as plain numbers: what a plan reads instead of tensors, and the arithmetic that fuses regions at a point.
 
-use candle_core::{Device, Tensor};
-
+use super::{
+    features::{Features, LocalFeatures},
+    reach::Reach,
+};
 use crate::{
     camera::INPUT_SCALE,
     config::{DensityKind, Fusion, Residual},
@@ -33,21 +35,6 @@ pub enum LocalInitial {
     },
     /// One more local generator whose residual head is the distance.
     Network(LocalWeights),
-}
-
-/// The linear map from activations to features; all portraits'.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LocalFeatures {
-    /// F.
-    pub count: usize,
-    /// W, or W + 3 with the view direction.
-    pub columns: usize,
-    /// `[9, F, columns]`.
-    pub weight: Vec<f32>,
-    /// `[9, F]`.
-    pub bias: Vec<f32>,
-    /// Whether the last three columns are the view direction's.
-    pub sees_view: bool,
 }
 
 /// One portrait's field, see [`super::super::RadianceField::local`].
@@ -98,7 +85,7 @@ impl LocalWeights {
     }
 
     /// middle and radius of each output of a head of `index`.
-    fn ranges(&self, index: usize, head: &Linear) -> impl Iterator<Item = (f32, f32)> {
+    pub(super) fn ranges(&self, index: usize, head: &Linear) -> impl Iterator<Item = (f32, f32)> {
         let (weights, _) = self.region(index);
         let rows = weights[head.weight.clone()].chunks_exact(head.inputs);
         // The sum's own rounding, and sines that round to just above 1.
@@ -125,99 +112,6 @@ impl LogitRange {
     }
 }
 
-/// How far the surface can lie from the sphere that it starts as. Heads read sines, so a residual is no less than its
-/// bias minus the sum of its weights' magnitudes, and a mask's logit no more than its bias plus that sum, whatever the
-/// point. Under softmax Σ m_i Δd_i is a mean of the Δd_i: what is known of some of them, and these limits of the others,
-/// limit it from below.
-#[derive(Clone, Debug)]
-pub struct Reach {
-    /// The sphere's, world units.
-    radius: f32,
-    /// Regions, those first that can pull the surface furthest out.
-    pub order: Vec<usize>,
-    /// In that order: the least Δd of this region and all behind it, world units.
-    least: Vec<f32>,
-    /// In that order: the largest Σ exp(logit) over this region and all behind it.
-    largest: Vec<f32>,
-    /// What raw masks are multiplied by.
-    sharpness: f32,
-    /// World units per unit of a raw residual.
-    scale: f32,
-}
-
-/// A point as its regions become known in the order of a [`Reach`].
-#[derive(Clone, Copy, Debug)]
-pub struct PartlyKnown {
-    /// Distance to the sphere, world units.
-    initial: f32,
-    /// Σ exp(logit) of the known regions.
-    weight: f32,
-    /// Σ exp(logit) Δd of the known regions.
-    moment: f32,
-}
-
-impl Reach {
-    /// What rounding may add to a distance, world units: a thousandth of any α that a surface is rendered with.
-    const ROUNDING: f32 = 1e-6;
-
-    /// Of the fields that have one: gated residuals around a sphere, masks that share 1.
-    fn new(local: &LocalField, regions: usize) -> Option<Self> {
-        let (Fusion::Softmax { sharpness }, Residual::Gated, DensityKind::ResidualSdf, LocalInitial::Sphere { radius }) =
-            (local.fusion, local.residual, local.density, &local.initial)
-        else {
-            return None;
-        };
-        let (layout, scale) = (local.generators.shape.layout(), local.residual_scale as f32);
-        let limits: Vec<(f32, f32)> = (0..regions)
-            .filter_map(|region| {
-                let (residual, residual_radius) = local.generators.ranges(region, &layout.residual).next()?;
-                let (mask, mask_radius) = local.generators.ranges(region, &layout.mask).next()?;
-                let logit = mask * sharpness as f32 + mask_radius * sharpness.abs() as f32;
-                Some((residual * scale - residual_radius * scale.abs() - Self::ROUNDING, logit.exp() * 1.000_1))
-            })
-            .collect();
-        let mut order: Vec<usize> = (0..limits.len()).collect();
-        order.sort_by(|left, right| limits[*left].0.total_cmp(&limits[*right].0));
-        let (mut least, mut largest) = (vec![0.0; order.len()], vec![0.0; order.len()]);
-        let (mut lowest, mut sum) = (f32::INFINITY, 0.0);
-        for (place, region) in order.iter().enumerate().rev() {
-            let (residual, weight) = limits[*region];
-            // Not `min`: NaN must spread, so that nothing is proven by it.
-            lowest = if residual > lowest { lowest } else { residual };
-            sum += weight;
-            (least[place], largest[place]) = (lowest, sum);
-        }
-        Some(Self { radius: *radius as f32, order, least, largest, sharpness: sharpness as f32, scale })
-    }
-
-    /// A world point of which no region is known.
-    pub fn start(&self, point: [f32; 3]) -> PartlyKnown {
-        PartlyKnown { initial: length(point) - self.radius, weight: 0.0, moment: 0.0 }
-    }
-
-    /// The least signed distance, world units, where the regions before `place` of the order are known. NaN if any of
-    /// it is.
-    pub fn least_distance(&self, known: &PartlyKnown, place: usize) -> f32 {
-        let (least, largest) = (self.least[place], self.largest[place]);
-        let mean = if place == 0 {
-            least
-        } else {
-            let mean = known.moment / known.weight;
-            // The others pull the mean down the further the more they weigh, but not below what is known if they cannot
-            // lie below it.
-            if least >= mean { mean } else { (known.moment + largest * least) / (known.weight + largest) }
-        };
-        known.initial + mean - Self::ROUNDING
-    }
-
-    /// One more region is known by its raw mask and residual.
-    pub fn learn(&self, known: &mut PartlyKnown, raw: &[f32]) {
-        let weight = (raw[0] * self.sharpness).exp();
-        known.weight += weight;
-        known.moment += weight * raw[1] * self.scale;
-    }
-}
-
 /// A point's fused values.
 #[derive(Clone, Copy, Debug)]
 pub struct FusedPoint {
@@ -240,53 +134,6 @@ pub struct Ready {
     pub reach: Option<Reach>,
     /// Features of activations, where they are shown.
     pub features: Option<Features>,
-}
-
-/// What makes features of activations, see [`LocalFeatures`].
-pub struct Features {
-    /// Per region, `[W, F]`.
-    weights: Vec<Tensor>,
-    local: LocalFeatures,
-}
-
-impl Features {
-    fn new(local: &LocalFeatures, width: usize) -> Result<Self> {
-        let weight = Tensor::from_slice(&local.weight, (REGION_COUNT, local.count, local.columns), &Device::Cpu)?;
-        let weight = weight.narrow(2, 0, width)?.transpose(1, 2)?;
-        let weights = (0..REGION_COUNT).map(|region| Ok(weight.get(region)?.contiguous()?)).collect::<Result<_>>()?;
-        Ok(Self { weights, local: local.clone() })
-    }
-
-    /// F.
-    pub fn count(&self) -> usize {
-        self.local.count
-    }
-
-    /// Adds what a region's activations `[n, W]`, those of `rays`, make of the rays' features `[R, F]`.
-    pub fn add(&self, region: Region, rays: &[u32], activations: Vec<f32>, features: &mut [f32]) -> Result<()> {
-        let (Some(weight), false) = (self.weights.get(region.index()), rays.is_empty()) else { return Ok(()) };
-        let rows = Tensor::from_vec(activations, (rays.len(), weight.dim(0)?), &Device::Cpu)?.matmul(weight)?;
-        let rows = rows.flatten_all()?.to_vec1::<f32>()?;
-        for (ray, row) in rays.iter().zip(rows.chunks_exact(self.count())) {
-            add_scaled(&mut features[*ray as usize * self.count()..][..self.count()], 1.0, row);
-        }
-        Ok(())
-    }
-
-    /// Adds what does not depend on activations: what a ray's masks `[9]` and the direction it is seen from add.
-    pub fn add_constant(&self, masks: &[f32], view: [f32; 3], features: &mut [f32]) {
-        let LocalFeatures { count, columns, weight, bias, sees_view } = &self.local;
-        for (region, mask) in masks.iter().enumerate().filter(|(_, mask)| **mask != 0.0) {
-            add_scaled(features, *mask, &bias[region * count..][..*count]);
-            if *sees_view {
-                let rows = weight[region * count * columns..].chunks_exact(*columns);
-                for (feature, row) in features.iter_mut().zip(rows) {
-                    let seen = row[columns - 3..].iter().zip(view).map(|(weight, view)| weight * view);
-                    *feature += mask * seen.sum::<f32>();
-                }
-            }
-        }
-    }
 }
 
 /// sum += scale · terms.
@@ -438,3 +285,27 @@ pub fn sigmoid(x: f32) -> f32 {
 }
 
 const _: () = assert!(REGION_COUNT <= 16, "sets of regions are kept in 16 bits");
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use candle_core::Device;
+
+    use super::*;
+    use crate::{model::generator::Generator, render::RadianceField as _};
+
+    #[test]
+    fn distances_are_found_for_densities() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/cartoon.safetensors");
+        let generator = Generator::open(Path::new(path), &Device::Cpu).unwrap();
+        let field = generator.field().portraits(&generator.codes_from_seed(5, 1.0).unwrap()).unwrap();
+        let ready = Ready::new(field.local(0).unwrap().unwrap(), Outputs::default()).unwrap();
+        for density in [1e-3, 1.0, 100.0] {
+            let found = ready.density(ready.distance_of(density));
+            assert!((found / density - 1.0).abs() < 1e-3, "{found} {density}");
+        }
+        // Denser than anything gets: everywhere is less dense.
+        assert!(ready.density(ready.distance_of(1e9)) > 0.99 * ready.local.inverse_alpha);
+    }
+}

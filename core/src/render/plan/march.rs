@@ -6,8 +6,9 @@ use crate::{
     region::REGION_COUNT,
     render::plan::{
         CUT_SHARE, EMPTY_SHARE,
-        local::{PartlyKnown, Reach, Ready},
+        local::Ready,
         rays::Rays,
+        reach::{PartlyKnown, Reach},
         state::{ChunkState, Room},
     },
 };

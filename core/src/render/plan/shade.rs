@@ -7,7 +7,8 @@ use crate::{
     region::{REGION_COUNT, Region},
     render::plan::{
         Shown,
-        local::{Features, LocalInitial, Ready, add_scaled, length, scaled, sigmoid},
+        features::Features,
+        local::{LocalInitial, Ready, add_scaled, length, scaled, sigmoid},
         march::Marched,
         rays::Rays,
         select::Selection,
