@@ -28,7 +28,7 @@ pub struct Report {
     pub frames: usize,
     /// Median seconds of an exact frame.
     pub exact_seconds_per_frame: f64,
-    /// Seconds of the whole orbit over shared geometry, making that included, over the number of frames.
+    /// Median seconds of a frame over shared geometry, and its share of making that.
     pub shared_seconds_per_frame: f64,
     /// Largest difference of any pixel of any frame, [0, 1] colour units.
     pub max_error: f64,
@@ -102,9 +102,8 @@ pub fn run(
             bound = bound.max(found.report.bound);
             progress(index + 1);
         }
-        let total: f64 = shared.iter().sum::<f64>() + grid_seconds;
-        let shared_seconds_per_frame = total / cameras.len().max(1) as f64;
-        let exact_timing = Timing::of(whole);
+        let (exact_timing, shared_timing) = (Timing::of(whole), Timing::of(shared));
+        let shared_seconds_per_frame = shared_timing.median_seconds + grid_seconds / cameras.len().max(1) as f64;
         Ok(Report {
             frames: cameras.len(),
             exact_seconds_per_frame: exact_timing.median_seconds,
@@ -118,7 +117,7 @@ pub fn run(
             grid_bytes: sequence.memory(),
             planned_seconds_per_frame: Timing::of(planned).median_seconds,
             exact: exact_timing,
-            shared: Timing::of(shared),
+            shared: shared_timing,
             scene: scene.describe(),
             path: path.name(),
             machine,

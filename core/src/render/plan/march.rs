@@ -41,23 +41,33 @@ pub struct Marched {
     pub samples_evaluated: usize,
 }
 
-/// A ray's optical depth as it is marched.
-#[derive(Clone, Copy, Default)]
+/// A ray's light as it is marched.
+#[derive(Clone, Copy)]
 pub struct Light {
+    /// Optical depth so far.
     through: f32,
+    left: f32,
+}
+
+impl Default for Light {
+    /// All of it.
+    fn default() -> Self {
+        Self { through: 0.0, left: 1.0 }
+    }
 }
 
 impl Light {
     /// Transmittance that is left.
     pub fn left(self) -> f32 {
-        (-self.through).exp()
+        self.left
     }
 
     /// Weight of a sample of this density and length; `takes_all` gives it all that is left.
     pub fn pass(&mut self, density: f32, length: f32, takes_all: bool) -> f32 {
         let optical = (density * length).min(OPAQUE);
-        let arriving = self.left();
+        let arriving = self.left;
         self.through += optical;
+        self.left = (-self.through).exp();
         // NaN densities must show, so no clamping beyond the bound that tensors have too.
         if takes_all { arriving } else { arriving * -(-optical).exp_m1() }
     }
@@ -175,7 +185,7 @@ impl Proof<'_> {
     ) -> Result<usize> {
         let regions = field.regions.len();
         self.open.extend(samples.iter().map(|sample| (*sample, self.reach.start(rays.point(*sample as usize)))));
-        let mut evaluated = 0;
+        let before: Vec<u16> = samples.iter().map(|sample| state.known[*sample as usize]).collect();
         let mut wanted = Vec::with_capacity(samples.len());
         for (place, region) in self.reach.order.iter().enumerate() {
             let (reach, empty_from, empty) = (self.reach, self.empty_from, &mut *self.empty);
@@ -190,16 +200,13 @@ impl Proof<'_> {
                 }
                 !is_empty
             });
-            let pairs = state.fill_shape(field, rays, &wanted, *region, room)?;
-            // Whatever is known of a sample, the first region is known first.
-            evaluated += if place == 0 { pairs } else { 0 };
-            marched.shape_pairs += pairs;
+            marched.shape_pairs += state.fill_shape(field, rays, &wanted, *region, room)?;
             for (sample, known) in &mut self.open {
                 let raw = &state.raw[(*sample as usize * regions + region) * 2..][..2];
                 self.reach.learn(known, raw);
             }
         }
-        Ok(evaluated)
+        Ok(samples.iter().zip(before).filter(|(sample, before)| state.known[**sample as usize] != *before).count())
     }
 }
 

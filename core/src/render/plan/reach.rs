@@ -102,7 +102,6 @@ mod tests {
 
     use candle_core::Device;
 
-    use super::*;
     use crate::{
         kernels::Outputs,
         model::generator::Generator,

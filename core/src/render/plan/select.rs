@@ -189,9 +189,11 @@ impl Charges {
     /// What rounding may take of a ray's budget.
     fn rounding(&self, marched: &Marched, samples: std::ops::Range<usize>) -> f32 {
         let regions = self.logits.len();
-        let masks = marched.masks[samples.start * regions..samples.end * regions].chunks_exact(regions);
-        let logits =
-            masks.map(|masks| masks.iter().zip(&self.logits).map(|(mask, logit)| mask.abs() * logit).sum::<f32>());
+        let lit = samples.filter(|sample| marched.weights[*sample] != 0.0);
+        let logits = lit.map(|sample| {
+            let masks = marched.masks[sample * regions..][..regions].iter();
+            masks.zip(&self.logits).map(|(mask, logit)| mask.abs() * logit).sum::<f32>()
+        });
         let largest = logits.fold(0.0, f32::max);
         ROUNDING as f32 + ROUNDING_PER_LOGIT as f32 * largest
     }

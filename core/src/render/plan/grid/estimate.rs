@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// What estimates from the vertices are multiplied by.
-pub const SAFETY: f32 = 2.0;
+const SAFETY: f32 = 2.0;
 /// How far a unit of mask that goes from one region to another moves a colour: sigmoid's slope times a difference of
 /// logits; of the built-in portraits' near their surface 0.1 at the median, 0.6 at most.
 const COLOUR_SLOPE: f32 = 1.0;
