@@ -316,14 +316,14 @@ impl TrainConfig {
                 schedule: Schedule { warmup_steps: 50, hold: 0.4, floor: 0.05 },
                 betas: [0.9, 0.99],
                 pixels: 1.0,
-                perceptual: 0.15,
+                perceptual: 0.6,
                 texture: 0.0,
                 perceptual_zoom: 2.0,
                 adversarial: 0.0,
                 adversarial_crop: 64,
                 hard_masks: true,
-                random_portraits: 2,
-                agreement: 0.0,
+                random_portraits: 1,
+                agreement: 1.0,
                 agreement_turn_rad: 0.5,
                 discriminator_ahead_steps: 200,
                 channel_multiplier: 0.125,
@@ -438,7 +438,15 @@ impl TrainConfig {
                 channel_multiplier: 0.03125,
                 ..small.field
             },
-            upsampler: UpsamplerStageConfig { steps: 30, batch: 4, crop: 16, perceptual: 0.0, ..small.upsampler },
+            upsampler: UpsamplerStageConfig {
+                steps: 30,
+                batch: 4,
+                crop: 16,
+                perceptual: 0.0,
+                agreement: 0.0,
+                random_portraits: 2,
+                ..small.upsampler
+            },
             ..small
         }
     }
