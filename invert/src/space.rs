@@ -100,12 +100,13 @@ fn cholesky(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
 fn inverted(lower: &[Vec<f64>]) -> Vec<Vec<f64>> {
     let length = lower.len();
     let mut inverse = vec![vec![0.0; length]; length];
-    for column in 0..length {
-        for row in column..length {
-            let sum: f64 = (column..row).map(|k| lower[row][k] * inverse[k][column]).sum();
-            let unit = if row == column { 1.0 } else { 0.0 };
-            inverse[row][column] = (unit - sum) / lower[row][row];
-        }
+    for (row, line) in lower.iter().enumerate() {
+        let solved = |column: usize| {
+            let sum: f64 = (column..row).map(|k| line[k] * inverse[k][column]).sum();
+            (if row == column { 1.0 } else { 0.0 } - sum) / line[row]
+        };
+        let values: Vec<f64> = (0..=row).map(solved).collect();
+        inverse[row][..=row].copy_from_slice(&values);
     }
     inverse
 }
