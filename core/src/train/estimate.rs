@@ -51,10 +51,12 @@ fn of_stage(config: &TrainConfig, stage: Stage, inputs: &Inputs, start: Option<&
     let mut small = config.clone();
     let batches = [&mut small.warmup.batch, &mut small.field.batch, &mut small.upsampler.batch];
     batches.into_iter().for_each(|batch| *batch = 1);
+    // Without pairs these are the whole batch.
+    small.upsampler.random_portraits = small.upsampler.random_portraits.min(1);
     let batch = |config: &TrainConfig| match stage {
         Stage::Warmup => config.warmup.batch,
         Stage::Field => config.field.batch,
-        Stage::Upsampler | Stage::All => config.upsampler.batch,
+        Stage::Upsampler | Stage::All => config.upsampler.batch.max(config.upsampler.random_portraits),
     };
     let scale = batch(config) as f64;
     let mut run = begin(stage, &small, inputs, start)?;
