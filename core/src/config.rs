@@ -260,4 +260,8 @@ pub struct GeneratorConfig {
     pub camera_deviation_rad: [f64; 2],
     /// Samples per ray when nothing else is asked for.
     pub samples: usize,
+    /// Principal components of training portraits' codes that portraits are drawn from; 0 draws noise through the
+    /// mapping network (paper).
+    #[serde(default)]
+    pub population: usize,
 }

@@ -6,4 +6,5 @@ pub mod file;
 pub mod generator;
 pub mod layers;
 pub mod mapping;
+pub mod population;
 pub mod upsampler;

@@ -9,12 +9,12 @@ pub mod events;
 pub mod field_stage;
 pub mod losses;
 pub mod optimiser;
+pub mod people;
 pub mod portrait_codes;
 pub mod preview;
 pub mod team;
 #[cfg(test)]
 mod test_data;
-pub mod texture;
 pub mod trainer;
 pub mod upsampler_stage;
 pub mod warmup;

@@ -1,13 +1,16 @@
 //! Fits a model's near start to the portraits it was trained on and the codes it gave them:
 //!
-//!     cargo run --release -p cnerf-invert --example fit_start -- DATA CODES.safetensors OUT
+//!     cargo run --release -p cnerf-invert --example fit_start -- DATA RUN/model.safetensors OUT
 //!
 //! Ridge regression; the penalty is the best of a few for the last tenth of the portraits, which are then added.
 
 use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
-use cnerf_core::{data::dataset::Dataset, train::portrait_codes::PortraitCodes};
+use cnerf_core::{
+    data::dataset::Dataset,
+    train::{people::People, trainer::Start},
+};
 use cnerf_invert::start::{FEATURES, NearStart, features};
 use image::imageops;
 use nalgebra::DMatrix;
@@ -16,9 +19,12 @@ const PENALTIES: [f64; 5] = [1.0, 3.0, 10.0, 30.0, 100.0];
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [data, codes, output] = arguments.as_slice() else { return Err("usage: fit_start DATA CODES OUT".into()) };
+    let [data, model, output] = arguments.as_slice() else { return Err("usage: fit_start DATA MODEL OUT".into()) };
     let dataset = Dataset::open(data)?;
-    let noise = PortraitCodes::read(Path::new(codes), &Device::Cpu)?.noise;
+    let Start { generator, portrait_codes } = Start::open(Path::new(model), &Device::Cpu)?;
+    let codes = portrait_codes.ok_or("no codes.safetensors beside the model")?;
+    let population = generator.population().ok_or("the model has no population")?;
+    let noise = population.coordinates(&codes.all(&generator)?)?.detach();
     // Mirror images come after the plain ones, as in training.
     let (mut plain, mut mirrored) = (Vec::new(), Vec::new());
     for index in 0..dataset.len() {
@@ -30,9 +36,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let count = plain.len() + mirrored.len();
     let values: Vec<f32> = plain.into_iter().chain(mirrored).flatten().collect();
     let inputs = Tensor::from_vec(values, (count, FEATURES), &Device::Cpu)?;
-    if noise.dim(0)? != count {
-        return Err(format!("{codes}: codes of {} portraits, but the data has {count}", noise.dim(0)?).into());
+    let people = People::of(&dataset, true);
+    if noise.dim(0)? != people.count() {
+        let expected = people.count();
+        return Err(format!("{model}: codes of {} portraits, but the data has {expected}", noise.dim(0)?).into());
     }
+    // Every view is a way to its person's code.
+    let person: Vec<u32> = people.pictures().into_iter().map(|picture| people.row(picture) as u32).collect();
+    let noise = noise.index_select(&Tensor::new(person, &Device::Cpu)?, 0)?;
     let half = count / 2;
     let last = half - half / 10;
     let (seen, held): (Vec<u32>, Vec<u32>) = (0..count as u32).partition(|row| (*row as usize % half) < last);

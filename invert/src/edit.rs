@@ -138,8 +138,7 @@ impl Goal {
             }
             Self::Direction(number) => {
                 let rows = directions(&opened.generator, regions, edit.aspect, *number)?;
-                let style_dim = rows.dim(1)?;
-                let direction = rows.narrow(0, number.saturating_sub(1), 1)?.reshape((1, 1, 1, style_dim))?;
+                let direction = rows.narrow(0, number.saturating_sub(1), 1)?;
                 (opened.codes.broadcast_add(&direction)?, regions)
             }
             Self::Painted(map) => {

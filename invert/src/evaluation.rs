@@ -162,19 +162,12 @@ impl People {
             return Ok(Self { source: Source::Photos(photos) });
         }
         let dataset = Dataset::open(path)?;
-        let mut people: Vec<(Option<u64>, Vec<usize>)> = Vec::new();
-        for (index, entry) in dataset.entries().iter().enumerate() {
-            let head = entry.extra.get("head").and_then(|head| head.as_u64());
-            match people.iter_mut().find(|(other, _)| head.is_some() && *other == head) {
-                Some((_, items)) => items.push(index),
-                None => people.push((head, vec![index])),
-            }
-        }
+        let people = dataset.people();
         if people.is_empty() {
             return Err(Error::malformed(path, "holds no portraits"));
         }
         let order = random.permutation(people.len());
-        let people = order.into_iter().take(count).filter_map(|index| Some(people.get(index)?.1.clone())).collect();
+        let people = order.into_iter().take(count).filter_map(|index| people.get(index).cloned()).collect();
         Ok(Self { source: Source::Dataset { dataset: Box::new(dataset), people } })
     }
 

@@ -1,8 +1,8 @@
 //! The pivot: codes of all nine regions and the camera, found by descent on the picture they give.
 //!
-//! Coarse to fine: first one code for all rows and rays of the field alone, then every row free, then whole pictures
-//! at the output resolution. Codes live in whitened coordinates ([`CodeSpace`]), held to the model's distribution by
-//! their mean square and to one person by their spread around their mean. Several photos of one person share the codes;
+//! Coarse to fine: first coordinates that move all rows together, on rays of the field alone, then every row free, then
+//! whole pictures at the output resolution. Codes live in whitened spaces ([`CodeSpace`]), held to the model's
+//! distribution by their mean square and to one person by their distance from where all rows move together. Several photos of one person share the codes;
 //! each has its own camera, and steps take them in turn.
 
 use candle_core::{Tensor, Var};
@@ -44,7 +44,7 @@ pub struct Pivot {
     steps: Steps,
     seed: u64,
     space: CodeSpace,
-    /// Whitened, one row for all, `[1, D]`.
+    /// Coordinates, `[1, K]`.
     shared: Var,
     /// Whitened, `[18, D]`; row 2 i + j is aspect j of region i.
     rows: Var,
@@ -59,7 +59,7 @@ pub struct Pivot {
 }
 
 impl Pivot {
-    /// Starts at the portrait of the noise `start` `[1, D]`, else at the model's mean portrait, seen by one of `cameras`
+    /// Starts at the portrait of the noise `start` `[1, noise_dim]`, else at the model's mean portrait, seen by one of `cameras`
     /// in each photo.
     pub fn new(
         generator: &Generator,
@@ -71,10 +71,10 @@ impl Pivot {
         let device = generator.device();
         let shared = match start {
             Some(noise) => {
-                let codes = generator.map(&noise.to_device(&device)?)?;
-                space.whitened(&codes)?.clamp(-MOST_UNUSUAL, MOST_UNUSUAL)?.detach()
+                let codes = generator.codes_of(&noise.to_device(&device)?)?;
+                space.coordinates(&codes)?.clamp(-MOST_UNUSUAL, MOST_UNUSUAL)?.detach()
             }
-            None => Tensor::zeros((1, space.style_dim()), candle_core::DType::F32, &device)?,
+            None => Tensor::zeros((1, space.coordinate_count()), candle_core::DType::F32, &device)?,
         };
         let zeros = |rows: usize| Var::zeros((rows, space.style_dim()), candle_core::DType::F32, &device);
         let global = matches!(&generator.config().upsampler, Some(u) if u.style == UpsamplerStyle::Global);
@@ -171,7 +171,7 @@ impl Pivot {
     /// One step, on the photo whose turn it is; `targets` are as many as there are cameras.
     pub fn step(&mut self, generator: &Generator, targets: &[Target]) -> Result<StepReport> {
         if self.step == self.steps.shared {
-            self.rows.set(&self.shared.as_tensor().broadcast_as(self.rows.shape())?.contiguous()?)?;
+            self.rows.set(&self.space.whitened(&self.space.at(self.shared.as_tensor())?)?.detach())?;
             self.optimiser = self.optimiser_of(self.rows.clone());
         }
         let whole = self.step >= self.steps.shared + self.steps.free;
@@ -210,12 +210,15 @@ impl Pivot {
     }
 
     fn live_codes(&self) -> Result<Tensor> {
-        let rows = if self.step < self.steps.shared { &self.shared } else { &self.rows };
-        self.space.to_portrait(rows.as_tensor())
+        if self.step < self.steps.shared {
+            self.space.at(self.shared.as_tensor())
+        } else {
+            self.space.to_portrait(self.rows.as_tensor())
+        }
     }
 
     fn live_global(&self) -> Result<Option<Tensor>> {
-        self.global.as_ref().map(|code| self.space.to_codes(code.as_tensor())).transpose()
+        self.global.as_ref().map(|code| self.space.to_global(code.as_tensor())).transpose()
     }
 
     fn ray_loss(&self, generator: &Generator, target: &Target, camera: &Tensor) -> Result<Loss> {
@@ -241,17 +244,19 @@ impl Pivot {
     }
 
     fn regularisation(&self) -> Result<Tensor> {
-        let rows = if self.step < self.steps.shared { &self.shared } else { &self.rows }.as_tensor();
-        let mut total = (rows.sqr()?.mean_all()? * self.config.prior)?;
-        if rows.dim(0)? > 1 {
-            let spread = rows.broadcast_sub(&rows.mean_keepdim(0)?)?.sqr()?.mean_all()?;
-            total = (total + (spread * self.config.agreement)?)?;
-        }
+        let mut total = if self.step < self.steps.shared {
+            (self.shared.as_tensor().sqr()?.mean_all()? * self.config.prior)?
+        } else {
+            let rows = self.rows.as_tensor();
+            let together = self.space.at(&self.space.coordinates(&self.space.to_portrait(rows)?)?)?;
+            let apart = (rows - self.space.whitened(&together)?)?.sqr()?.mean_all()?;
+            ((rows.sqr()?.mean_all()? * self.config.prior)? + (apart * self.config.agreement)?)?
+        };
         if let Some(global) = &self.global {
             total = (total + (global.as_tensor().sqr()?.mean_all()? * self.config.prior)?)?;
         }
         let [angle, shift, zoom] = self.config.camera_prior.map(|deviation| 1.0 / deviation.max(1e-6) as f32);
-        let scale = Tensor::new(&[[angle, angle, angle, shift, shift, zoom]], rows.device())?;
+        let scale = Tensor::new(&[[angle, angle, angle, shift, shift, zoom]], self.rows.device())?;
         for (camera, first) in self.cameras.iter().zip(&self.first_cameras) {
             let moved = ((camera.as_tensor() - first)? * &scale)?;
             total = (total + (moved.sqr()?.sum_all()? * self.config.camera)?)?;

@@ -1,8 +1,9 @@
 //! A near start: what a photo and its regions say about its code, by one linear map.
 //!
 //! Training portraits have codes of their own, begun as principal components of small pictures and masks (the recipe)
-//! and trained since. Ridge regression from the same small pictures finds the noise z behind such a code again, and the
-//! mapping network turns it into the code: a portrait with the right hair, skin and background before the first step.
+//! and trained since. Ridge regression from the same small pictures finds the noise behind such codes again (their
+//! coordinates in the model's population, or the z of a model without), and the model turns it into codes: a portrait
+//! with the right hair, skin and background before the first step.
 //!
 //! Fitted by `cargo run --release -p cnerf-invert --example fit_start` to a model's training portraits; what is embedded
 //! is a table of regression weights, no picture.
@@ -45,7 +46,7 @@ pub struct NearStart {
 }
 
 impl NearStart {
-    /// A map from features (see [`features`]) to z: `weight` `[FEATURES, D]`, `bias` `[1, D]`.
+    /// A map from features (see [`features`]) to noise: `weight` `[FEATURES, D]`, `bias` `[1, D]`.
     ///
     /// # Errors
     /// If the shapes are others.
@@ -80,7 +81,7 @@ impl NearStart {
         Ok(file::write_safetensors(path, &tensors, &[(FILE_KEY, header)])?)
     }
 
-    /// The noise z `[1, D]` of an aligned portrait whose regions are known.
+    /// The noise `[1, noise_dim]` of an aligned portrait whose regions are known.
     pub fn noise(&self, portrait: &RgbImage, labels: &LabelMap) -> Result<Tensor> {
         let features = Tensor::from_vec(features(portrait, labels)?, (1, FEATURES), &Device::Cpu)?;
         Ok((features.matmul(&self.weight)? + &self.bias)?)

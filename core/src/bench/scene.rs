@@ -51,7 +51,8 @@ impl Scene {
     /// The authors' sizes, see [`SceneKind::Reference`].
     pub fn reference(seed: u64) -> Result<Self> {
         let field = FieldConfig { alpha_initial: REFERENCE_ALPHA, ..FieldConfig::paper() };
-        let config = GeneratorConfig { field, upsampler: None, camera_deviation_rad: [0.3, 0.15], samples: 24 };
+        let config =
+            GeneratorConfig { field, upsampler: None, camera_deviation_rad: [0.3, 0.15], samples: 24, population: 0 };
         let generator = Generator::new(&config, &Parameters::fresh(seed, DType::F32, &Device::Cpu))?;
         let codes = generator.codes_from_seed(seed, 1.0)?;
         // The authors' upsampler reads features: so they are rendered, though there is no upsampler here.

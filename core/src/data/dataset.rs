@@ -91,6 +91,24 @@ impl Dataset {
         &self.entries
     }
 
+    /// Items by person, in order of first appearance: those with the same integer in the field `head` (as `cnerf synth
+    /// --views` writes it) are views of one person, every other item is a person of its own.
+    pub fn people(&self) -> Vec<Vec<usize>> {
+        let mut people: Vec<Vec<usize>> = Vec::new();
+        let mut known = HashMap::new();
+        for (index, entry) in self.entries().iter().enumerate() {
+            let person = match entry.extra.get("head").and_then(|head| head.as_u64()) {
+                Some(head) => *known.entry(head).or_insert(people.len()),
+                None => people.len(),
+            };
+            match people.get_mut(person) {
+                Some(views) => views.push(index),
+                None => people.push(vec![index]),
+            }
+        }
+        people
+    }
+
     /// Fields of `dataset.json` beside `labels`, `classes` and `items`.
     pub fn extra(&self) -> &Map<String, Value> {
         &self.extra

@@ -171,6 +171,24 @@ impl Perceptual {
         Ok(Self { backbone, convolutions, heads, shift: constant(SHIFT)?, scale: constant(SCALE)? })
     }
 
+    /// An AlexNet of random weights.
+    #[cfg(test)]
+    pub(crate) fn of_noise(seed: u64) -> Result<Self> {
+        let mut random = crate::rng::Stream::new(seed, &[]);
+        let mut tensors = HashMap::new();
+        for (index, [output, input, window]) in Backbone::AlexNet.convolutions().into_iter().enumerate() {
+            let weight = random.normal_tensor(&[output, input, window, window], &Device::Cpu)?;
+            let fan_in = (input * window * window) as f64;
+            tensors.insert(format!("conv{index}.weight"), (weight * (2.0 / fan_in).sqrt())?);
+            tensors.insert(format!("conv{index}.bias"), Tensor::zeros(output, DType::F32, &Device::Cpu)?);
+        }
+        for (index, channels) in Backbone::AlexNet.channels().into_iter().enumerate() {
+            let head = Tensor::full(1.0 / channels as f32, (1, channels, 1, 1), &Device::Cpu)?;
+            tensors.insert(format!("lin{index}.weight"), head);
+        }
+        Self::from_tensors(&tensors)
+    }
+
     /// Which backbone this is.
     pub fn backbone(&self) -> Backbone {
         self.backbone

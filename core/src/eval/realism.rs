@@ -18,13 +18,14 @@ use crate::{
     data::{
         dataset::{Dataset, Item},
         labels::LabelMap,
+        loader::Draw,
         picture::{self, RgbImage},
     },
     error::{Error, Result},
     model::generator::Generator,
     region::{REGION_COUNT, Region},
     rng::Stream,
-    train::portrait_codes::PortraitCodes,
+    train::{people::People, portrait_codes::PortraitCodes},
 };
 
 /// Width and height that the blur reference is reduced to, pixels.
@@ -306,9 +307,10 @@ pub struct Reconstruction {
     pub lpips: Option<f64>,
 }
 
-/// Whether there is a code for every photo of `dataset`, or for it and its mirrored copy.
+/// Whether there is a code for everyone on the photos of `dataset`, or for them and their mirror images.
 pub fn are_codes_of(portraits: &PortraitCodes, dataset: &Dataset) -> bool {
-    [dataset.len(), 2 * dataset.len()].contains(&portraits.count())
+    let people = People::of(dataset, false).count();
+    [people, 2 * people].contains(&portraits.count())
 }
 
 /// Shows training portraits from their own codes (photos in the data set's order, then mirrored copies), and compares
@@ -327,12 +329,14 @@ pub fn reconstruction(
         let expected = format!("codes of {} portraits and their mirrored copies", dataset.len());
         return Err(Error::shape("training codes", expected, portraits.noise.dims()));
     }
+    let people = People::of(dataset, false);
     let (device, resolution) = (generator.device(), generator.output_resolution());
     let (mut found, mut agreement, mut distance) = (Reconstruction::default(), Agreement::default(), 0.0);
     let mut masked = false;
     for index in chosen(dataset, options) {
         let Item { image, mask, camera } = dataset.item(index)?;
-        let codes = portraits.codes(generator, &[index as u32])?.detach();
+        let row = people.row(Draw { index, mirrored: false }) as u32;
+        let codes = portraits.codes(generator, &[row])?.detach();
         let shown = picture_of(generator, &codes, None, &camera.unwrap_or_default())?;
         let psnr = |rgb: &Tensor, side: usize| -> Result<f64> {
             Ok(quality::psnr(rgb, &at(&image, side, &device)?)?.first().copied().unwrap_or_default())

@@ -51,7 +51,13 @@ pub fn generator(state: &HashMap<String, Tensor>) -> Result<Generator> {
     for (name, value) in [("z_mean", 0f32), ("z_deviation", 1.0), ("w_mean", 0.0)] {
         tensors.insert(format!("{STATISTICS}.{name}"), Tensor::full(value, style_dim, &Device::Cpu)?);
     }
-    let config = GeneratorConfig { field, upsampler, camera_deviation_rad: CAMERA_DEVIATION_RAD, samples: SAMPLES };
+    let config = GeneratorConfig {
+        field,
+        upsampler,
+        camera_deviation_rad: CAMERA_DEVIATION_RAD,
+        samples: SAMPLES,
+        population: 0,
+    };
     let generator = Generator::from_tensors(&config, tensors, &Device::Cpu)?;
     generator.measure(None)?;
     Ok(generator)

@@ -179,6 +179,7 @@ mod tests {
             upsampler: None,
             camera_deviation_rad: [0.3, 0.15],
             samples: 24,
+            population: 0,
         };
         let header =
             ModelHeader { version: 1, config, preset: "tiny".into(), provenance: "test".into(), hash: String::new() };

@@ -12,6 +12,7 @@ use crate::{
         field::Field,
         file::{self, ModelHeader, Tensors},
         mapping::Mapping,
+        population::Population,
         upsampler::{Noise, Upsampler, UpsamplerInput, UpsamplerOutput},
     },
     parameters::{Init, Parameters},
@@ -41,6 +42,7 @@ pub struct Generator {
     z_statistics: (Tensor, Tensor),
     /// Mean w, `[D]`.
     w_mean: Tensor,
+    population: Option<Population>,
     header: Option<ModelHeader>,
     /// See [`Self::with_budget`].
     budget: f64,
@@ -69,6 +71,9 @@ impl Generator {
             .map(|upsampler| Upsampler::new(upsampler, config.field.width, style_dim, &parameters.within("upsampler")))
             .transpose()?;
         let statistics = parameters.within(STATISTICS);
+        let population = (config.population > 0)
+            .then(|| Population::new(config.population, style_dim, &statistics.within("population")))
+            .transpose()?;
         let statistic = |name: &str, value: f64| statistics.get(name, &[style_dim], Init::Constant(value));
         Ok(Self {
             config: config.clone(),
@@ -78,6 +83,7 @@ impl Generator {
             upsampler,
             z_statistics: (statistic("z_mean", 0.0)?, statistic("z_deviation", 1.0)?),
             w_mean: statistic("w_mean", 0.0)?,
+            population,
             header: None,
             budget: 0.0,
         })
@@ -127,6 +133,21 @@ impl Generator {
         let mut tensors = bare.parameters.snapshot()?;
         tensors.extend(fresh.snapshot()?);
         let config = GeneratorConfig { upsampler: Some(upsampler.clone()), ..config };
+        Self::from_tensors(&config, tensors, &self.parameters.device())
+    }
+
+    /// The same weights with portraits drawn from another population: of mean `[18 D]` and components `[K, 18 D]` (see
+    /// [`Population`]), or none.
+    pub fn with_population(&self, population: Option<(&Tensor, &Tensor)>) -> Result<Self> {
+        let under = format!("{STATISTICS}.population.");
+        let mut tensors = self.parameters.snapshot()?;
+        tensors.retain(|name, _| !name.starts_with(&under));
+        let mut config = GeneratorConfig { population: 0, ..self.config.clone() };
+        if let Some((mean, components)) = population {
+            config.population = components.dim(0)?;
+            tensors.insert(format!("{under}mean"), mean.clone());
+            tensors.insert(format!("{under}components"), components.clone());
+        }
         Self::from_tensors(&config, tensors, &self.parameters.device())
     }
 
@@ -180,7 +201,7 @@ impl Generator {
         self.parameters.device()
     }
 
-    /// z `[B, D]` to w `[B, D]`. z is in units of the model's own spread (see [`Self::draw_z`]).
+    /// z `[B, D]` to w `[B, D]`. z is in units of the model's own spread (see [`Self::spread`]).
     pub fn map(&self, z: &Tensor) -> Result<Tensor> {
         self.mapping.forward(z)
     }
@@ -190,9 +211,22 @@ impl Generator {
         &self.w_mean
     }
 
-    /// z of a random portrait, `[1, D]`, a function of `seed`.
-    pub fn draw_z(&self, seed: u64) -> Result<Tensor> {
-        self.spread(&Stream::new(seed, &[0x7a]).normal_tensor(&[1, self.config.field.style_dim], &self.device())?)
+    /// The principal components that portraits are drawn from, if the model has them.
+    pub fn population(&self) -> Option<&Population> {
+        self.population.as_ref()
+    }
+
+    /// Length of the noise behind a portrait: a population's size, else `style_dim`.
+    pub fn noise_dim(&self) -> usize {
+        self.population.as_ref().map_or(self.config.field.style_dim, Population::size)
+    }
+
+    /// Codes `[B, 9, 2, D]` of portraits from standard normals `[B, noise_dim]`. Differentiable.
+    pub fn codes_of(&self, noise: &Tensor) -> Result<Tensor> {
+        match &self.population {
+            Some(population) => population.codes(noise),
+            None => codes::broadcast(&self.map(&self.spread(noise)?)?),
+        }
     }
 
     /// Standard normals `[B, D]` as z of this model's own mean and spread.
@@ -203,13 +237,17 @@ impl Generator {
 
     /// Codes `[1, 9, 2, D]` of the random portrait `seed`, truncated by `psi` towards the mean (1 leaves them).
     pub fn codes_from_seed(&self, seed: u64, psi: f64) -> Result<Tensor> {
-        let codes = codes::broadcast(&self.map(&self.draw_z(seed)?)?)?;
-        codes::truncate(&codes, &self.w_mean, psi)
+        let noise = Stream::new(seed, &[0x7a]).normal_tensor(&[1, self.noise_dim()], &self.device())?;
+        let codes = self.codes_of(&noise)?;
+        codes::truncate(&codes, &self.mean_codes()?.squeeze(0)?, psi)
     }
 
     /// The mean portrait's codes, `[1, 9, 2, D]`.
     pub fn mean_codes(&self) -> Result<Tensor> {
-        codes::broadcast(&self.w_mean.unsqueeze(0)?)
+        match &self.population {
+            Some(population) => population.mean(),
+            None => codes::broadcast(&self.w_mean.unsqueeze(0)?),
+        }
     }
 
     /// Takes the spread of z from the codes `[M, D]` of a training set, and measures the mean w.

@@ -203,13 +203,15 @@ pub struct UpsamplerStageConfig {
     pub pixels: f64,
     /// Weight of LPIPS against it (needs `--lpips`).
     pub perceptual: f64,
-    /// Weight of the difference of textures in small tiles, by the first features of the same network: pixels and
-    /// LPIPS alone prefer a blur where strands of hair fall elsewhere than in the photo. 0 trains without it.
-    pub texture: f64,
     /// LPIPS sees crops enlarged by a factor drawn from 1 to this. At one fixed scale AlexNet's stride of 4 cannot tell
     /// hair from hatching of that period, and the upsampler learns to hatch.
     pub perceptual_zoom: f64,
-    /// Weight of the non-saturating adversarial loss.
+    /// Weight of heads on the perceptual network's features that tell photos from pictures (Sauer et al., 2021). They see
+    /// pairs and, with `random_portraits`, those. Paper: 0.
+    pub critic: f64,
+    /// Learning rate of those heads.
+    pub critic_learning_rate: f64,
+    /// Weight of the non-saturating adversarial loss of the high-resolution discriminator.
     pub adversarial: f64,
     /// Side of the square the discriminator sees, pixels of the picture, a power of two. Paper: the whole picture. On
     /// squares, a few hundred photos give it many times as much to learn from.
@@ -225,7 +227,7 @@ pub struct UpsamplerStageConfig {
     pub agreement: f64,
     /// The second view is turned by up to this, radians; more often by less.
     pub agreement_turn_rad: f64,
-    /// Steps the discriminator learns alone before its verdict counts. Paper: 0.
+    /// Steps a discriminator or critic learns alone before its verdict counts. Paper: 0.
     pub discriminator_ahead_steps: usize,
     /// Channels of the discriminator relative to the authors' tables.
     pub channel_multiplier: f64,
@@ -265,7 +267,7 @@ impl TrainConfig {
             checkpoint_steps: 500,
             sample_steps: 500,
             log_steps: 20,
-            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 12 },
+            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 12, population: 256 },
             warmup: WarmupConfig {
                 steps: 16_000,
                 batch: 32,
@@ -317,8 +319,9 @@ impl TrainConfig {
                 betas: [0.9, 0.99],
                 pixels: 1.0,
                 perceptual: 0.6,
-                texture: 0.0,
                 perceptual_zoom: 2.0,
+                critic: 0.0,
+                critic_learning_rate: 5e-4,
                 adversarial: 0.0,
                 adversarial_crop: 64,
                 hard_masks: true,
@@ -341,7 +344,7 @@ impl TrainConfig {
         let upsampler = Some(UpsamplerConfig::paper(field.style_dim));
         let small = Self::small(Preset::Ffhq, [0.3, 0.15]);
         Self {
-            model: GeneratorConfig { field, upsampler, camera_deviation_rad: [0.3, 0.15], samples: 24 },
+            model: GeneratorConfig { field, upsampler, camera_deviation_rad: [0.3, 0.15], samples: 24, population: 0 },
             warmup: WarmupConfig { steps: 0, ..small.warmup.clone() },
             field: Self::paper_field_stage(),
             upsampler: Self::paper_upsampler_stage(),
@@ -386,8 +389,9 @@ impl TrainConfig {
             discriminator_betas: [0.0, 0.99],
             pixels: 0.0,
             perceptual: 0.0,
-            texture: 0.0,
             perceptual_zoom: 1.0,
+            critic: 0.0,
+            critic_learning_rate: 5e-4,
             adversarial: 1.0,
             adversarial_crop: 512,
             hard_masks: false,

@@ -90,9 +90,10 @@ impl FieldStage {
     fn with_type(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>, dtype: DType) -> Result<Self> {
         let stage = config.field.clone();
         let generator = match start {
-            Some(start) => start.generator.with_upsampler(None, 0)?,
+            // Noise goes through the mapping network, which is trained here.
+            Some(start) => start.generator.with_upsampler(None, 0)?.with_population(None)?,
             None => {
-                let model = GeneratorConfig { upsampler: None, ..config.model.clone() };
+                let model = GeneratorConfig { upsampler: None, population: 0, ..config.model.clone() };
                 Generator::new(&model, &Parameters::fresh(config.seed, dtype, &inputs.device))?
             }
         };

@@ -12,7 +12,7 @@ use crate::{
         file::{self, Tensors},
         generator::Generator,
     },
-    train::optimiser::Betas,
+    train::{optimiser::Betas, whiten::principal_components},
 };
 
 /// Names of the tensors in a run's code file and in checkpoints.
@@ -42,6 +42,24 @@ impl PortraitCodes {
             Some(offsets) => Ok((mapped + offsets.index_select(&rows, 0)?)?),
             None => Ok(mapped),
         }
+    }
+
+    /// All codes, `[M, 9, 2, D]`.
+    pub fn all(&self, generator: &Generator) -> Result<Tensor> {
+        let rows: Vec<u32> = (0..self.count() as u32).collect();
+        self.codes(generator, &rows)
+    }
+
+    /// `generator` with the `size` first principal components of these codes as its population, or as many as there can
+    /// be; 0 leaves it without.
+    pub fn population(&self, generator: &Generator, size: usize, seed: u64) -> Result<Generator> {
+        let size = size.min(self.count().saturating_sub(1));
+        if size == 0 {
+            return Ok(generator.clone());
+        }
+        let codes = self.all(generator)?.detach().flatten_from(1)?;
+        let components = principal_components(&codes, size, seed)?;
+        generator.with_population(Some((&codes.mean(0)?, &components)))
     }
 
     /// Adds the tensors that [`Self::take`] reads.

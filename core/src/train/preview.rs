@@ -6,16 +6,28 @@ use image::{RgbImage, imageops};
 use crate::{
     camera::Camera,
     codes::{self, Aspect},
-    data::{labels::LabelMap, picture},
+    data::{labels::LabelMap, loader::Cached, picture},
     error::Result,
     model::generator::{Generator, Picture},
     region::Region,
+    train::people::People,
 };
 
 /// Side of a cell, pixels.
 const CELL: u32 = 96;
 /// Side views, radians.
 const SIDE_RAD: f64 = 0.4;
+/// Training portraits shown.
+const COUNT: usize = 6;
+
+/// Training portraits spread over the set: their rows among the codes, and the cameras of their first views.
+pub fn spread(people: &People, portraits: &Cached) -> (Vec<u32>, Vec<Camera>) {
+    let everyone = people.count();
+    let count = everyone.min(COUNT);
+    // Not mirrored ones, of which the second half of the rows is made: whoever looks knows the photos.
+    let rows = (0..count).map(|place| place * everyone / (2 * count));
+    rows.map(|row| (row as u32, portraits.camera(people.first_view(row)).unwrap_or_default())).unzip()
+}
 
 /// A row for each of: the training portraits' pictures, region maps and normals, both side views and the normals of
 /// one, hair shape and hair texture swapped between neighbours, random portraits, their normals and a side view.

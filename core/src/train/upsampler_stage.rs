@@ -1,24 +1,27 @@
 //! Stage `upsampler`: the field frozen, the 2D generator learns to lift its renders.
 //!
-//! Three teachers, mixed by their weights: the portrait a training code belongs to (shared/recipe: every warmed-up
+//! Four teachers, mixed by their weights: the portrait a training code belongs to (shared/recipe: every warmed-up
 //! portrait's soft render is paired with its sharp photo; L1 and LPIPS on crops), a high-resolution discriminator
-//! (the paper's second stage), which judges random portraits and, where there are pairs, their pictures too, and the
-//! agreement of two views of a random portrait.
+//! (the paper's second stage) and a critic on a classifier's features, which judge random portraits and, where there are
+//! pairs, their pictures too, and the agreement of two views of a random portrait.
 
 mod adversary;
 mod agreement;
+mod critic;
 mod pairs;
+mod zoom;
 
 use candle_core::{DType, Device, Tensor};
 use image::RgbImage;
 
 use self::{
     adversary::{Adversary, Judged},
+    critic::{Critic, Seen},
     pairs::{Pairs, Square},
+    zoom::Zoom,
 };
 use crate::{
     camera::Camera,
-    codes,
     error::{Error, Result},
     eval::perceptual::Perceptual,
     model::{
@@ -37,24 +40,18 @@ use crate::{
         optimiser::{Adam, Betas, Group},
         preview,
         team::Team,
-        texture::texture,
         trainer::{Inputs, StageRun, Start},
     },
 };
 
 /// The first element of every stream drawn here.
 const STREAM: u64 = 0x7570_7361;
-/// LPIPS sees each crop shifted by up to this, pixels: AlexNet's stride of 4 with crops on even offsets draws stripes.
-const LARGEST_SHIFT: usize = 3;
 /// Path lengths are measured on a batch smaller by this (authors).
 const PATH_BATCH_SHRINK: usize = 2;
 /// Share of a new batch in the running mean of path lengths (authors).
 const PATH_DECAY: f64 = 0.01;
 /// Name of that mean in checkpoints.
 const PATH_MEAN: &str = "path_length_mean";
-
-/// Training portraits on a sample grid.
-const PREVIEWED: usize = 6;
 
 /// The running stage.
 pub struct UpsamplerStage {
@@ -70,13 +67,16 @@ pub struct UpsamplerStage {
     path_mean: Tensor,
     pairs: Option<Pairs>,
     adversary: Option<Adversary>,
+    critic: Option<Critic>,
 }
 
-/// What a step's pairs give: their loss, and what a discriminator may see of them.
+/// What a step's pairs give: their loss, and what a discriminator and a critic may see of them.
 struct PairedPictures {
     loss: Tensor,
     real: Judged,
     fake: Judged,
+    /// Photos and pictures, where there is a classifier.
+    seen: Option<[Seen; 2]>,
 }
 
 /// Renders of random portraits; a person's views in a row.
@@ -91,6 +91,7 @@ struct RandomRenders {
 #[derive(Default)]
 struct RandomPictures {
     judged: Option<Judged>,
+    seen: Option<Seen>,
     loss: Option<Tensor>,
 }
 
@@ -112,21 +113,28 @@ impl UpsamplerStage {
         } else {
             start.generator.with_upsampler(Some(wanted), config.seed)?
         };
+        // A field's stage leaves none, and neither did warm-ups before there were populations.
+        let generator = match start.portrait_codes.as_ref().filter(|_| generator.population().is_none()) {
+            Some(codes) => codes.population(&generator, config.model.population, config.seed)?,
+            None => generator,
+        };
         let resolution = wanted.output_resolution;
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
         let variables = generator.parameters().within("upsampler").variables();
         let group = Group { variables, learning_rate: stage.learning_rate, largest_gradient_norm: None };
         let optimiser = Adam::new(vec![group], betas).in_team(&inputs.team);
-        if (stage.perceptual > 0.0 || stage.texture > 0.0) && inputs.perceptual.is_none() {
-            let reason = "needs LPIPS weights; pass --lpips FILE, or --set upsampler.perceptual=0 upsampler.texture=0";
+        if (stage.perceptual > 0.0 || stage.critic > 0.0) && inputs.perceptual.is_none() {
+            let reason = "needs LPIPS weights; pass --lpips FILE, or --set upsampler.perceptual=0 upsampler.critic=0";
             return Err(Error::config("upsampler.perceptual", reason));
         }
-        let pairs = (stage.pixels > 0.0 || stage.perceptual > 0.0 || stage.texture > 0.0)
+        let pairs = (stage.pixels > 0.0 || stage.perceptual > 0.0 || stage.critic > 0.0)
             .then(|| Pairs::new(config, inputs, start.portrait_codes.as_ref(), resolution))
             .transpose()?;
         let adversary = (stage.adversarial > 0.0)
             .then(|| Adversary::new(config, inputs, resolution, pairs.is_none()))
             .transpose()?;
+        let critic = inputs.perceptual.as_ref().filter(|_| stage.critic > 0.0);
+        let critic = critic.map(|network| Critic::new(&stage, config.seed, network.backbone(), inputs)).transpose()?;
         let seen = stage.crop.min(wanted.input_resolution) * resolution / wanted.input_resolution;
         if adversary.is_some() && stage.adversarial_crop.min(resolution) > seen {
             let reason = format!("must be at most {seen}, what a crop of {} shows", stage.crop);
@@ -153,6 +161,7 @@ impl UpsamplerStage {
             path_mean: Tensor::zeros((), DType::F32, &inputs.device)?,
             pairs,
             adversary,
+            critic,
         })
     }
 
@@ -167,35 +176,26 @@ impl UpsamplerStage {
         let pixels = (losses::colour_l1(&output.rgb, &batch.photo)? * 2.0)?;
         metrics.push_loss("pixels", &pixels)?;
         let mut loss = (&pixels * config.pixels)?;
-        if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0 || config.texture > 0.0) {
-            let [x, y] = [random.below(LARGEST_SHIFT + 1), random.below(LARGEST_SHIFT + 1)];
-            let side = batch.photo.dim(2)? - LARGEST_SHIFT;
-            let zoom = f64::from(random.range(1.0, config.perceptual_zoom as f32));
-            let enlarged = enlargement(side, (side as f64 * zoom).round() as usize, &self.device)?;
-            let view = |picture: &Tensor| -> Result<Tensor> {
-                let crop = picture.narrow(2, y, side)?.narrow(3, x, side)?.contiguous()?;
-                Ok(enlarged.broadcast_matmul(&crop)?.broadcast_matmul(&enlarged.t()?)?)
-            };
-            let found = perceptual.features(&view(&output.rgb)?)?;
-            let expected = perceptual.features(&view(&batch.photo)?)?;
-            let distance = perceptual.feature_distance(&found, &expected)?.mean_all()?;
+        let mut seen = None;
+        if let Some(perceptual) = self.perceptual.as_ref().filter(|_| config.perceptual > 0.0 || config.critic > 0.0) {
+            let zoom = Zoom::random(batch.photo.dim(2)?, config.perceptual_zoom, &mut random, &self.device)?;
+            let [found, expected] = [&output.rgb, &batch.photo].map(|picture| seen_by(perceptual, &zoom, picture));
+            let (found, expected) = (found?, expected?);
+            let distance = perceptual.feature_distance(&found.features, &expected.features)?.mean_all()?;
             metrics.push_loss("perceptual", &distance)?;
             loss = (loss + (distance * config.perceptual)?)?;
-            if let Some((found, expected)) = found.first().zip(expected.first()).filter(|_| config.texture > 0.0) {
-                let difference = texture(found, expected)?;
-                metrics.push_loss("texture", &difference)?;
-                loss = (loss + (difference * config.texture)?)?;
-            }
+            seen = Some([expected, found]);
         }
         let real = Judged { image: batch.photo, masks: batch.masks };
         let fake = Judged { image: output.rgb, masks: output.masks };
-        Ok(Some(PairedPictures { loss, real, fake }))
+        Ok(Some(PairedPictures { loss, real, fake, seen }))
     }
 
     /// Pictures of random portraits for the discriminator, and how far their views disagree.
     fn random_pictures(&self, step: usize, metrics: &mut Metrics) -> Result<RandomPictures> {
         let config = &self.config;
-        if config.random_portraits == 0 || (self.adversary.is_none() && config.agreement == 0.0) {
+        let judged = self.adversary.is_some() || self.critic.is_some();
+        if config.random_portraits == 0 || !(judged || config.agreement > 0.0) {
             return Ok(RandomPictures::default());
         }
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
@@ -205,7 +205,9 @@ impl UpsamplerStage {
         if config.agreement == 0.0 {
             let frame = square.of_frame(&renders.frame)?;
             let output = self.generator.upsample_with(&frame, &renders.codes, None, Noise::Drawn(&mut random))?;
-            return Ok(RandomPictures { judged: Some(Judged { image: output.rgb, masks: output.masks }), loss: None });
+            let seen = self.seen_by_critic(&output.rgb, &mut random)?;
+            let judged = Some(Judged { image: output.rgb, masks: output.masks });
+            return Ok(RandomPictures { judged, seen, loss: None });
         }
         // Views are compared whole: squares of them would show other parts of the head.
         let output = self.generator.upsample_with(&renders.frame, &renders.codes, None, Noise::Drawn(&mut random))?;
@@ -215,7 +217,30 @@ impl UpsamplerStage {
         }
         let factor = self.generator.output_resolution() / self.generator.render_resolution();
         let judged = Judged { image: square.of(&output.rgb, factor)?, masks: square.of(&output.masks, factor)? };
-        Ok(RandomPictures { judged: Some(judged), loss: loss.map(|loss| loss * config.agreement).transpose()? })
+        let seen = self.seen_by_critic(&judged.image, &mut random)?;
+        Ok(RandomPictures { judged: Some(judged), seen, loss: loss.map(|loss| loss * config.agreement).transpose()? })
+    }
+
+    /// What the critic sees of random portraits `[B, 3, side, side]`, if there is one.
+    fn seen_by_critic(&self, pictures: &Tensor, random: &mut Stream) -> Result<Option<Seen>> {
+        let Some(perceptual) = self.perceptual.as_ref().filter(|_| self.critic.is_some()) else { return Ok(None) };
+        let zoom = Zoom::random(pictures.dim(2)?, self.config.perceptual_zoom, random, &self.device)?;
+        seen_by(perceptual, &zoom, pictures).map(Some)
+    }
+
+    /// Trains the critic and returns what it asks of the generator, weighted; nothing while it still runs ahead alone.
+    fn criticism(
+        &mut self,
+        step: usize,
+        pairs: Option<[Seen; 2]>,
+        random_portraits: Option<Seen>,
+        metrics: &mut Metrics,
+    ) -> Result<Option<Tensor>> {
+        let (Some(critic), Some([real, fake])) = (&mut self.critic, pairs) else { return Ok(None) };
+        let fakes: Vec<Seen> = std::iter::once(fake).chain(random_portraits).collect();
+        let asked = critic.judge(&real, &fakes, metrics)?;
+        let heard = step >= self.config.discriminator_ahead_steps;
+        Ok(if heard { Some((asked * self.config.critic)?) } else { None })
     }
 
     /// Trains the discriminator and returns the generator's adversarial loss.
@@ -266,8 +291,8 @@ impl UpsamplerStage {
     fn random_renders(&self, people: usize, views: usize, random: &mut Stream) -> Result<RandomRenders> {
         let share = self.team.share();
         let people = share.whole(people);
-        let z = random.normal_tensor(&[people, self.generator.config().field.style_dim], &self.device)?;
-        let codes = codes::broadcast(&self.generator.map(&self.generator.spread(&z)?)?.detach())?;
+        let noise = random.normal_tensor(&[people, self.generator.noise_dim()], &self.device)?;
+        let codes = self.generator.codes_of(&noise)?.detach();
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
         let mut cameras = Vec::new();
         for _ in 0..people {
@@ -292,13 +317,14 @@ impl UpsamplerStage {
 impl StageRun for UpsamplerStage {
     fn step(&mut self, step: usize) -> Result<Metrics> {
         let mut metrics = Metrics::default();
-        let (paired_loss, pictures) = match self.paired_pictures(step, &mut metrics)? {
-            Some(paired) => (Some(paired.loss), Some((paired.real, paired.fake))),
-            None => (None, None),
+        let (paired_loss, pictures, seen) = match self.paired_pictures(step, &mut metrics)? {
+            Some(paired) => (Some(paired.loss), Some((paired.real, paired.fake)), paired.seen),
+            None => (None, None, None),
         };
         let random = self.random_pictures(step, &mut metrics)?;
         let adversarial = self.adversarial_loss(step, pictures, random.judged, &mut metrics)?;
-        let losses = [paired_loss, random.loss, adversarial, self.path_length(step, &mut metrics)?];
+        let criticism = self.criticism(step, seen, random.seen, &mut metrics)?;
+        let losses = [paired_loss, random.loss, adversarial, criticism, self.path_length(step, &mut metrics)?];
         let total = losses.into_iter().flatten().map(Ok).reduce(|sum: Result<Tensor>, loss| Ok((sum? + loss?)?));
         let total = match total {
             Some(total) => total?,
@@ -327,6 +353,9 @@ impl StageRun for UpsamplerStage {
         if let Some(adversary) = &self.adversary {
             adversary.save(tensors)?;
         }
+        if let Some(critic) = &self.critic {
+            critic.save(tensors)?;
+        }
         self.optimiser.save("adam", tensors)
     }
 
@@ -338,13 +367,16 @@ impl StageRun for UpsamplerStage {
         if let Some(adversary) = &mut self.adversary {
             adversary.load(tensors)?;
         }
+        if let Some(critic) = &mut self.critic {
+            critic.load(tensors)?;
+        }
         self.optimiser.load("adam", tensors)
     }
 
     fn samples(&self) -> Result<RgbImage> {
         let finished = self.finished()?.generator;
         let Some(pairs) = &self.pairs else { return preview::random_grid(&finished) };
-        let (rows, cameras) = pairs.spread(PREVIEWED);
+        let (rows, cameras) = pairs.spread();
         preview::grid(&finished, &pairs.codes().codes(&finished, &rows)?, &cameras)
     }
 
@@ -355,18 +387,9 @@ impl StageRun for UpsamplerStage {
     }
 }
 
-/// Bilinear enlargement of a line of `source` pixels to `target` as a matrix `[target, source]`, pixel centres aligned
-/// as areas are, edges repeated: a product, so that candle differentiates it.
-fn enlargement(source: usize, target: usize, device: &Device) -> Result<Tensor> {
-    let mut weights = vec![0f32; target * source];
-    for (row, weights) in weights.chunks_exact_mut(source.max(1)).enumerate() {
-        let position = (row as f64 + 0.5) * source as f64 / target as f64 - 0.5;
-        let position = position.clamp(0.0, (source - 1) as f64);
-        let (left, share) = (position as usize, position.fract() as f32);
-        weights[left] += 1.0 - share;
-        weights[(left + 1).min(source - 1)] += share;
-    }
-    Ok(Tensor::from_vec(weights, (target, source), device)?)
+/// Pictures as a classifier sees them in one view.
+fn seen_by(perceptual: &Perceptual, zoom: &Zoom, pictures: &Tensor) -> Result<Seen> {
+    Ok(Seen { features: perceptual.features(&zoom.of(pictures)?)?, pixels: pictures.clone() })
 }
 
 #[cfg(test)]
@@ -380,25 +403,16 @@ mod tests {
         train::{config::Preset, portrait_codes::PortraitCodes, test_data::dataset},
     };
 
-    #[test]
-    fn enlargement_keeps_ramps_and_is_the_identity_at_one() {
-        let ramp = Tensor::arange(0f32, 8.0, &Device::Cpu).unwrap().reshape((8, 1)).unwrap();
-        let at = |target| enlargement(8, target, &Device::Cpu).unwrap().matmul(&ramp).unwrap();
-        let values = |tensor: Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        assert_eq!(values(at(8)), values(ramp.clone()));
-        // Between the outer pixels' centres a ramp stays one: value (row + 1/2) · 8/13 − 1/2.
-        for (row, value) in values(at(13)).into_iter().enumerate() {
-            let expected = ((row as f32 + 0.5) * 8.0 / 13.0 - 0.5).clamp(0.0, 7.0);
-            assert!((value - expected).abs() < 1e-5, "{row}: {value}, {expected}");
-        }
-    }
-
     /// A tiny stage with a discriminator, from a field with codes of its own for 4 portraits and their mirror images.
     fn stage(portraits: &Arc<Dataset>, settings: &[&str]) -> UpsamplerStage {
         let mut config = TrainConfig::preset(Preset::Tiny);
         config.upsampler.channel_multiplier = 1.0 / 128.0;
         let settings: Vec<String> = settings.iter().map(|setting| format!("upsampler.{setting}")).collect();
-        let config = config.with(&settings).unwrap();
+        let mut config = config.with(&settings).unwrap();
+        if let Some(upsampler) = config.model.upsampler.as_mut().filter(|_| config.upsampler.critic > 0.0) {
+            // The classifier wants pictures of 31 pixels, after shifts.
+            (upsampler.output_resolution, upsampler.channels, upsampler.blocks) = (64, vec![8; 3], vec![1; 3]);
+        }
         let mut random = Stream::new(4, &[]);
         let start = Start {
             generator: Generator::new(&config.model, &Parameters::fresh(1, DType::F32, &Device::Cpu)).unwrap(),
@@ -407,9 +421,10 @@ mod tests {
                 offsets: None,
             }),
         };
+        let perceptual = (config.upsampler.critic > 0.0).then(|| Perceptual::of_noise(1).unwrap());
         let inputs = Inputs {
             dataset: Arc::clone(portraits),
-            perceptual: None,
+            perceptual,
             start: None,
             device: Device::Cpu,
             team: Team::default(),
@@ -431,10 +446,12 @@ mod tests {
         let portraits = dataset(folder.path(), 4);
         let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
         let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=1", "random_portraits=2"];
+        let criticised = vec!["critic=0.1", "discriminator_ahead_steps=1", "random_portraits=1"];
         let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
         for (settings, quantities) in [
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
             (alone, &["discriminator", "adversarial"][..]),
+            (criticised, &["pixels", "perceptual", "critic", "criticised"][..]),
             (agreeing, &["pixels", "discriminator", "adversarial", "agreement"][..]),
         ] {
             let mut whole = stage(&portraits, &settings);

@@ -8,10 +8,7 @@ use crate::{
     camera::{self, Camera},
     codes,
     config::Background,
-    data::{
-        loader::{Cached, Draw},
-        picture::signed,
-    },
+    data::{loader::Cached, picture::signed},
     error::{Error, Result},
     model::{file::Tensors, generator::Generator},
     parameters::Parameters,
@@ -23,6 +20,7 @@ use crate::{
         events::Metrics,
         losses::{self, MINIMAL_SURFACE_SHARPNESS, RegionColours},
         optimiser::{Adam, Betas, Group},
+        people::People,
         portrait_codes::{PortraitCodes, RowTable},
         preview,
         team::Team,
@@ -52,20 +50,22 @@ const STREAM: u64 = 0x7761_726d;
 pub struct Warmup {
     config: WarmupConfig,
     seed: u64,
+    /// Components wanted of the codes.
+    population: usize,
     device: Device,
     team: Team,
     portraits: Cached,
-    mirror: bool,
+    people: People,
     generator: Generator,
     log_alpha: Var,
-    /// z of every portrait, then of every mirrored one, `[M, D]`.
+    /// z of every person, then of every mirrored one, `[M, D]`.
     codes: Var,
-    /// What every region of every portrait adds to its mapped z, `[M, 9, 2, D]`; none if the configuration wants none.
+    /// What every region of every person adds to its mapped z, `[M, 9, 2, D]`; none if the configuration wants none.
     region_codes: Option<RowTable>,
     betas: Betas,
-    /// Mean colour in [-1, 1] of each region of each portrait, `[M, 9, 3]`; mirrored portraits share theirs.
+    /// Mean colour in [-1, 1] of each region of each picture, as stored and mirrored, `[P, 9, 3]`.
     region_colours: Tensor,
-    /// 1 where a region is present, `[M, 9]`.
+    /// 1 where a region is present, `[P, 9]`.
     present: Tensor,
     optimiser: Adam,
 }
@@ -83,23 +83,24 @@ impl Warmup {
         resolutions.dedup();
         let portraits = Cached::new(&inputs.dataset, &resolutions, &|_| ())?;
         let generator = match start {
-            Some(start) => start.generator.with_upsampler(None, 0)?,
+            Some(start) => start.generator.with_upsampler(None, 0)?.with_population(None)?,
             None => {
-                let model = crate::config::GeneratorConfig { upsampler: None, ..config.model.clone() };
+                let model = crate::config::GeneratorConfig { upsampler: None, population: 0, ..config.model.clone() };
                 Generator::new(&model, &Parameters::fresh(config.seed, DType::F32, &inputs.device))?
             }
         };
-        let all = draws(portraits.len(), config.mirror);
-        let (features, region_colours, present) = describe(&portraits, &all, &inputs.device)?;
+        let people = People::of(&inputs.dataset, config.mirror);
+        let (features, region_colours, present) = describe(&portraits, &people, &inputs.device)?;
         let style_dim = generator.config().field.style_dim;
-        let known = start.and_then(|start| start.portrait_codes.as_ref()).filter(|known| known.count() == all.len());
+        let known =
+            start.and_then(|start| start.portrait_codes.as_ref()).filter(|known| known.count() == people.count());
         let codes = match known {
             Some(known) => known.noise.copy()?,
             None => whiten(&features, style_dim, config.seed)?,
         };
         let codes = Var::from_tensor(&codes)?;
         let mut region_codes =
-            (stage.region_codes_from < 1.0).then(|| RowTable::zeros(all.len(), &[REGION_COUNT, 2, style_dim]));
+            (stage.region_codes_from < 1.0).then(|| RowTable::zeros(people.count(), &[REGION_COUNT, 2, style_dim]));
         if let (Some(table), Some(offsets)) = (&mut region_codes, known.and_then(|known| known.offsets.as_ref())) {
             table.set(offsets)?;
         }
@@ -117,14 +118,15 @@ impl Warmup {
         ];
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
         let optimiser = Adam::new(groups, betas).in_team(&inputs.team);
-        inputs.team.portraits(stage.batch, all.len())?;
+        inputs.team.portraits(stage.batch, people.count())?;
         Ok(Self {
             config: stage,
             seed: config.seed,
+            population: config.model.population,
             device: inputs.device.clone(),
             team: inputs.team.clone(),
             portraits,
-            mirror: config.mirror,
+            people,
             generator,
             log_alpha,
             codes,
@@ -143,22 +145,25 @@ impl Warmup {
         let second = progress >= config.first_resolution_share;
         let resolution = config.resolutions[usize::from(second)];
         let level = self.portraits.level(resolution)?;
-        let all = draws(self.portraits.len(), self.mirror);
-        let order = random.permutation(all.len());
+        let order = random.permutation(self.people.count());
         let share = self.team.share();
-        let whole: Vec<u32> =
-            order.into_iter().take(self.team.portraits(config.batch, all.len())?).map(|row| row as u32).collect();
+        let whole: Vec<u32> = order
+            .into_iter()
+            .take(self.team.portraits(config.batch, self.people.count())?)
+            .map(|row| row as u32)
+            .collect();
         let own = share.rows(whole.len());
         let batch = own.len();
         let rays = config.rays.min(resolution * resolution);
 
         let (mut pixels, mut colours, mut masks) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut cameras, mut rows) = (Vec::new(), Vec::new());
+        let (mut cameras, mut rows, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
         for (place, row) in whole.iter().enumerate() {
-            let draw = all[*row as usize];
+            let draw = self.people.view(*row as usize, &mut random);
             let is_own = own.contains(&place);
             if is_own {
                 rows.push(*row);
+                pictures.push(self.people.place(draw) as u32);
                 cameras.push(self.portraits.camera(draw).unwrap_or_default());
             }
             // Weighted draws without replacement: the largest u^(1/w) win (Efraimidis and Spirakis, 2006).
@@ -203,6 +208,7 @@ impl Warmup {
                 .transpose()?,
             whole_rows: whole,
             rows: Tensor::from_vec(rows, batch, device)?,
+            pictures: Tensor::from_vec(pictures, batch, device)?,
             cameras: Camera::parameter_tensor(&cameras, device)?,
             pixels: Tensor::from_vec(pixels, (batch, rays, 2), device)?,
             colours: Tensor::from_vec(colours, (batch, rays, 3), device)?.transpose(1, 2)?.contiguous()?,
@@ -271,8 +277,8 @@ impl Warmup {
     fn region_colours(&self, batch: &Batch, volume: usize) -> Result<RegionColours> {
         let first = REGION_COUNT - volume;
         Ok(RegionColours {
-            mean: self.region_colours.index_select(&batch.rows, 0)?.narrow(1, first, volume)?,
-            present: self.present.index_select(&batch.rows, 0)?.narrow(1, first, volume)?,
+            mean: self.region_colours.index_select(&batch.pictures, 0)?.narrow(1, first, volume)?,
+            present: self.present.index_select(&batch.pictures, 0)?.narrow(1, first, volume)?,
             masks: batch.masks.narrow(1, first, volume)?,
         })
     }
@@ -315,7 +321,10 @@ impl Warmup {
 
 struct Batch {
     resolution: usize,
+    /// Rows of the codes.
     rows: Tensor,
+    /// Places among the pictures.
+    pictures: Tensor,
     /// Rows of the codes that the whole team's step takes; `rows` are this process's.
     whole_rows: Vec<u32>,
     /// The rows' share of the table, to differentiate by: `[B, 9, 2, D]`.
@@ -382,12 +391,7 @@ impl StageRun for Warmup {
     }
 
     fn samples(&self) -> Result<RgbImage> {
-        let count = self.portraits.len().min(6);
-        let rows: Vec<u32> = (0..count).map(|index| (index * self.portraits.len() / count) as u32).collect();
-        let cameras: Vec<Camera> = rows
-            .iter()
-            .map(|row| self.portraits.camera(Draw { index: *row as usize, mirrored: false }).unwrap_or_default())
-            .collect();
+        let (rows, cameras) = preview::spread(&self.people, &self.portraits);
         let trained = self.portrait_codes()?.codes(&self.generator, &rows)?;
         preview::grid(&self.finished()?.generator, &trained, &cameras)
     }
@@ -395,27 +399,23 @@ impl StageRun for Warmup {
     fn finished(&self) -> Result<Start> {
         let generator = self.generator.duplicate()?;
         generator.measure(Some(self.codes.as_tensor()))?;
-        Ok(Start { generator, portrait_codes: Some(self.portrait_codes()?) })
+        let codes = self.portrait_codes()?;
+        let generator = codes.population(&generator, self.population, self.seed)?;
+        Ok(Start { generator, portrait_codes: Some(codes) })
     }
 }
 
-/// Every portrait, then every mirrored one.
-fn draws(count: usize, mirror: bool) -> Vec<Draw> {
-    let plain = (0..count).map(|index| Draw { index, mirrored: false });
-    let mirrored = (0..if mirror { count } else { 0 }).map(|index| Draw { index, mirrored: true });
-    plain.chain(mirrored).collect()
-}
-
-/// What first codes are computed from, `[M, F]`, and each region's mean colour `[M, 9, 3]` and presence `[M, 9]`.
-fn describe(portraits: &Cached, all: &[Draw], device: &Device) -> Result<(Tensor, Tensor, Tensor)> {
+/// What first codes are computed from, the mean of a person's views, `[M, F]`; and each region's mean colour `[P, 9, 3]`
+/// and presence `[P, 9]` in every picture.
+fn describe(portraits: &Cached, people: &People, device: &Device) -> Result<(Tensor, Tensor, Tensor)> {
     let level = portraits.level(CODE_RESOLUTION)?;
     let (mut features, mut colours, mut present) = (Vec::new(), Vec::new(), Vec::new());
-    for draw in all {
+    for draw in people.pictures() {
         let mut sums = [[0f32; 3]; REGION_COUNT];
         let mut areas = [0f32; REGION_COUNT];
         for pixel in 0..CODE_RESOLUTION * CODE_RESOLUTION {
             let (x, y) = (pixel % CODE_RESOLUTION, pixel / CODE_RESOLUTION);
-            let (colour, shares) = level.pixel(*draw, x, y).unwrap_or_default();
+            let (colour, shares) = level.pixel(draw, x, y).unwrap_or_default();
             let colour = colour.map(signed);
             features.extend(colour.map(|value| 0.5 * value));
             for (region, share) in shares.into_iter().enumerate() {
@@ -433,10 +433,11 @@ fn describe(portraits: &Cached, all: &[Draw], device: &Device) -> Result<(Tensor
         }
     }
     let columns = CODE_RESOLUTION * CODE_RESOLUTION * (3 + REGION_COUNT);
+    let count = people.pictures().len();
     Ok((
-        Tensor::from_vec(features, (all.len(), columns), device)?,
-        Tensor::from_vec(colours, (all.len(), REGION_COUNT, 3), device)?,
-        Tensor::from_vec(present, (all.len(), REGION_COUNT), device)?,
+        people.mean_of_views(&Tensor::from_vec(features, (count, columns), device)?)?,
+        Tensor::from_vec(colours, (count, REGION_COUNT, 3), device)?,
+        Tensor::from_vec(present, (count, REGION_COUNT), device)?,
     ))
 }
 

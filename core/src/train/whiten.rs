@@ -5,6 +5,7 @@
 //! rotation of whitened coordinates is whitened, so no eigenvectors are computed, only the subspace.
 
 use candle_core::{DType, Tensor};
+use nalgebra::{DMatrix, SymmetricEigen};
 
 use crate::{
     error::{Error, Result},
@@ -30,6 +31,32 @@ pub fn whiten(data: &Tensor, rank: usize, seed: u64) -> Result<Tensor> {
         basis = orthonormal(&gram.matmul(&basis)?)?;
     }
     Ok((basis * (rows as f64).sqrt())?)
+}
+
+/// Principal components `[rank, F]` of the rows of `data` `[M, F]`, the largest first, each as long as the standard
+/// deviation along it; its largest element is positive. `rank` must be below M.
+pub fn principal_components(data: &Tensor, rank: usize, seed: u64) -> Result<Tensor> {
+    let (rows, length) = data.dims2()?;
+    let centred = data.to_dtype(DType::F32)?.broadcast_sub(&data.to_dtype(DType::F32)?.mean_keepdim(0)?)?;
+    // Within the subspace that the whitened coordinates U √M span, the components are those of Uᵀ X: a small problem.
+    let coordinates = (whiten(data, rank, seed)? / rows as f64)?;
+    let within = coordinates.t()?.matmul(&centred)?.to_dtype(DType::F64)?;
+    let gram = within.matmul(&within.t()?)?.flatten_all()?.to_vec1::<f64>()?;
+    let eigen = SymmetricEigen::new(DMatrix::from_row_slice(rank, rank, &gram));
+    let mut order: Vec<usize> = (0..rank).collect();
+    let strength = |index: usize| eigen.eigenvalues.get(index).copied().unwrap_or(0.0);
+    order.sort_by(|a, b| strength(*b).total_cmp(&strength(*a)));
+    let turned: Vec<f64> = order
+        .into_iter()
+        .flat_map(|index| eigen.eigenvectors.column(index).iter().copied().collect::<Vec<_>>())
+        .collect();
+    let turned = Tensor::from_vec(turned, (rank, rank), data.device())?.matmul(&within)?;
+    let mut values: Vec<f64> = turned.flatten_all()?.to_vec1()?;
+    for component in values.chunks_exact_mut(length.max(1)) {
+        let largest = component.iter().copied().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(1.0);
+        component.iter_mut().for_each(|value| *value *= largest.signum());
+    }
+    Ok(Tensor::from_vec(values, (rank, length), data.device())?.to_dtype(DType::F32)?)
 }
 
 /// An orthonormal basis of the columns' span, by modified Gram-Schmidt in f64, twice for stability.
@@ -79,5 +106,21 @@ mod tests {
         let lost = (centred - kept).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
         assert!(lost < 0.02, "{lost}");
         assert!(whiten(&data, 50, 0).is_err());
+    }
+
+    #[test]
+    fn components_are_orthogonal_and_hold_the_variance() {
+        // 60 rows along two known directions, of deviations 3 and 1.
+        let mut random = Stream::new(2, &[]);
+        let rows: Vec<f32> =
+            (0..60).flat_map(|_| [3.0 * random.normal(), random.normal()]).flat_map(|value| [value, 5.0]).collect();
+        let data = Tensor::from_vec(rows, (60, 4), &Device::Cpu).unwrap();
+        let found = principal_components(&data, 2, 0).unwrap().to_vec2::<f32>().unwrap();
+        let dot = |a: usize, b: usize| found[a].iter().zip(&found[b]).map(|(x, y)| x * y).sum::<f32>();
+        assert!(dot(0, 1).abs() < 1e-4, "{found:?}");
+        let centred = data.broadcast_sub(&data.mean_keepdim(0).unwrap()).unwrap();
+        let variance = centred.sqr().unwrap().mean(0).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap();
+        assert!((dot(0, 0) + dot(1, 1) - variance).abs() < 1e-3 * variance);
+        assert!(dot(0, 0) > 4.0 * dot(1, 1) && found[0][0] > 2.0, "{found:?}");
     }
 }

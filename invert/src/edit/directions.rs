@@ -13,7 +13,7 @@ use cnerf_core::{
     codes::{self, Aspect},
     config::SHAPE_LAYERS,
     model::generator::Generator,
-    region::RegionSet,
+    region::{REGION_COUNT, RegionSet},
 };
 use image::RgbImage;
 use nalgebra::{DMatrix, SymmetricEigen};
@@ -25,23 +25,22 @@ use crate::{
     space::CodeSpace,
 };
 
-/// The first `count` directions of `regions` and `aspect`, strongest first: `[count, D]`, each one standard deviation
-/// of the model's codes long. The same for all of the regions named; signs are fixed, so that the same model gives
-/// the same directions.
+/// The first `count` directions of `regions` and `aspect`, strongest first: `[count, 9, 2, D]`, each one standard deviation
+/// of the model's portraits long. Signs are fixed, so that the same model gives the same directions.
 ///
 /// # Errors
 /// [`Error::Core`] if there are fewer directions.
 pub fn directions(model: &Generator, regions: RegionSet, aspect: Aspect, count: usize) -> Result<Tensor> {
     let space = CodeSpace::measure(model)?;
-    let length = space.style_dim();
+    let length = space.coordinate_count();
     if count == 0 || count > length {
         return Err(Error::config("--direction", format!("this model has directions 1 to {length}")));
     }
-    // What each unit step of whitened codes changes in each region's layers. The maps are affine: a unit step will do.
+    // What a unit step along each coordinate changes in each region's layers. The maps are affine: a unit step will do.
     let device = model.device();
-    let steps = Tensor::eye(length, DType::F32, &device)?;
+    let steps = space.components()?;
     let mean = model.mean_codes()?;
-    let moved = codes::broadcast(&space.displaced(&steps)?)?.broadcast_add(&mean)?;
+    let moved = steps.broadcast_add(&mean)?;
     let change = model.field().film(&moved)?.broadcast_sub(&model.field().film(&mean)?)?.detach();
     let layers = change.dim(2)?;
     let mut gram = Tensor::zeros((length, length), DType::F64, &device)?;
@@ -64,7 +63,8 @@ pub fn directions(model: &Generator, regions: RegionSet, aspect: Aspect, count: 
         let largest = vector.iter().copied().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(1.0);
         whitened.extend(vector.iter().map(|value| (value * largest.signum()) as f32));
     }
-    space.displaced(&Tensor::from_vec(whitened, (count, length), &device)?)
+    let directions = Tensor::from_vec(whitened, (count, length), &device)?.matmul(&steps.flatten_from(1)?)?;
+    Ok(directions.reshape((count, REGION_COUNT, 2, model.config().field.style_dim))?)
 }
 
 /// The portrait, read from `path`, moved along each of the first `count` directions by each of `amounts`: one row of
@@ -79,9 +79,8 @@ pub fn preview(
 ) -> Result<Vec<Vec<RgbImage>>> {
     let opened = Opened::new(portrait, path, model)?;
     let rows = directions(model, regions, aspect, count)?;
-    let style_dim = rows.dim(1)?;
     let picture = |direction: usize, amount: f64| -> Result<RgbImage> {
-        let step = rows.narrow(0, direction, 1)?.reshape((1, 1, 1, style_dim))?;
+        let step = rows.narrow(0, direction, 1)?;
         let goal = opened.codes.broadcast_add(&step)?;
         let codes = codes::blend(&opened.codes, &goal, regions, aspect, amount)?.detach();
         one_picture(&Opened { codes, ..opened.clone() }.picture(&portrait.camera)?.rgb)

@@ -25,7 +25,13 @@ pub fn small_generator(seed: u64) -> Generator {
         blocks: vec![1, 1],
         ..UpsamplerConfig::ours(16)
     };
-    let config = GeneratorConfig { field, upsampler: Some(upsampler), camera_deviation_rad: [0.3, 0.15], samples: 8 };
+    let config = GeneratorConfig {
+        field,
+        upsampler: Some(upsampler),
+        camera_deviation_rad: [0.3, 0.15],
+        samples: 8,
+        population: 0,
+    };
     let generator = Generator::new(&config, &Parameters::fresh(seed, DType::F32, &Device::Cpu)).unwrap();
     // Fresh heads give a grey ball: larger ones give portraits that can be told apart.
     let mut weights = generator.parameters().snapshot().unwrap();
@@ -283,7 +289,7 @@ fn directions_are_a_regions_own_strongest_first() {
     let mean = generator.mean_codes().unwrap();
     // What a step along a direction changes in the hair's shape layers.
     let effect = |direction: &Tensor| {
-        let moved = mean.broadcast_add(&direction.reshape((1, 1, 1, 16)).unwrap()).unwrap();
+        let moved = mean.broadcast_add(&direction.reshape((1, 9, 2, 16)).unwrap()).unwrap();
         let change = (film(&moved) - film(&mean)).unwrap().narrow(1, Region::Hair.index(), 1).unwrap();
         let change = change.narrow(2, 0, 3).unwrap().sqr().unwrap().sum_all().unwrap();
         f64::from(change.to_scalar::<f32>().unwrap())
@@ -297,7 +303,8 @@ fn directions_are_a_regions_own_strongest_first() {
     for _ in 0..20 {
         let step = random.normal_tensor(&[1, 16], &Device::Cpu).unwrap();
         let norm = step.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
-        let step = space.displaced(&(step / f64::from(norm)).unwrap()).unwrap();
+        let step = (step / f64::from(norm)).unwrap();
+        let step = step.matmul(&space.components().unwrap().flatten_from(1).unwrap()).unwrap();
         assert!(effect(&step) <= effects[0] * 1.001);
     }
     let eyes = edit::directions(&generator, Region::Eyes.into(), Aspect::Shape, 1).unwrap();

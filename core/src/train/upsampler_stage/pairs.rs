@@ -10,7 +10,7 @@ use crate::{
     region::REGION_COUNT,
     render::{Frame, RenderSettings, TwoPass},
     rng::Stream,
-    train::{config::TrainConfig, portrait_codes::PortraitCodes, team::Team, trainer::Inputs},
+    train::{config::TrainConfig, people::People, portrait_codes::PortraitCodes, preview, team::Team, trainer::Inputs},
 };
 
 /// Renders of training portraits are kept up to this many; beyond it they are rendered each time they are needed.
@@ -19,7 +19,8 @@ const MOST_KEPT: usize = 2_500;
 /// Training portraits with codes, and their renders.
 pub(super) struct Pairs {
     portraits: Cached,
-    draws: Vec<Draw>,
+    people: People,
+    pictures: Vec<Draw>,
     codes: PortraitCodes,
     renders: Vec<Option<Render>>,
     kept: usize,
@@ -73,19 +74,16 @@ impl Pairs {
         codes: Option<&PortraitCodes>,
         resolution: usize,
     ) -> Result<Self> {
-        let count = inputs.dataset.len();
-        let draws: Vec<Draw> = [false, true][..if config.mirror { 2 } else { 1 }]
-            .iter()
-            .flat_map(|mirrored| (0..count).map(|index| Draw { index, mirrored: *mirrored }))
-            .collect();
-        let codes = codes.filter(|codes| codes.count() == draws.len()).ok_or_else(|| {
+        let people = People::of(&inputs.dataset, config.mirror);
+        let pictures = people.pictures();
+        let codes = codes.filter(|codes| codes.count() == people.count()).ok_or_else(|| {
             let reason = "pairs need the codes a warm-up on the same data left beside its model; \
                           run --stage all, or --set upsampler.pixels=0 upsampler.perceptual=0";
             Error::config("upsampler.pixels", reason)
         })?;
         let portraits = Cached::new(&inputs.dataset, &[resolution], &|_| ())?;
-        let renders = vec![None; draws.len()];
-        Ok(Self { portraits, draws, codes: codes.clone(), renders, kept: 0, team: inputs.team.clone() })
+        let renders = vec![None; pictures.len()];
+        Ok(Self { portraits, people, pictures, codes: codes.clone(), renders, kept: 0, team: inputs.team.clone() })
     }
 
     /// The codes of all portraits.
@@ -93,12 +91,9 @@ impl Pairs {
         &self.codes
     }
 
-    /// `count` portraits spread over the set: their rows among the codes, and their cameras.
-    pub fn spread(&self, count: usize) -> (Vec<u32>, Vec<Camera>) {
-        let count = self.portraits.len().min(count);
-        let rows: Vec<usize> = (0..count).map(|index| index * self.portraits.len() / count).collect();
-        let camera = |row: &usize| self.portraits.camera(self.draws[*row]).unwrap_or_default();
-        (rows.iter().map(|row| *row as u32).collect(), rows.iter().map(camera).collect())
+    /// Portraits spread over the set: their rows among the codes, and their cameras.
+    pub fn spread(&self) -> (Vec<u32>, Vec<Camera>) {
+        preview::spread(&self.people, &self.portraits)
     }
 
     /// One random square of `count` random portraits.
@@ -112,15 +107,15 @@ impl Pairs {
     ) -> Result<PairBatch> {
         let (device, resolution) = (generator.device(), generator.output_resolution());
         let factor = resolution / generator.render_resolution();
-        let rows = random.permutation(self.draws.len());
-        let whole = self.team.portraits(count, rows.len())?;
-        let rows = self.team.share().pick(&rows[..whole]);
+        let places = random.permutation(self.pictures.len());
+        let whole = self.team.portraits(count, places.len())?;
+        let places = self.team.share().pick(&places[..whole]);
         let square = Square::random(crop, generator.render_resolution(), random);
-        let renders = rows.iter().map(|row| self.render(generator, *row)).collect::<Result<Vec<_>>>()?;
-        let draws: Vec<Draw> = rows.iter().map(|row| self.draws[*row]).collect();
+        let renders = places.iter().map(|place| self.render(generator, *place)).collect::<Result<Vec<_>>>()?;
+        let draws: Vec<Draw> = places.iter().map(|place| self.pictures[*place]).collect();
         let photos = self.portraits.batch(step as u64, &draws)?;
         let photos = photos.at(resolution)?;
-        let rows: Vec<u32> = rows.iter().map(|row| *row as u32).collect();
+        let rows: Vec<u32> = draws.iter().map(|draw| self.people.row(*draw) as u32).collect();
         Ok(PairBatch {
             frame: square.of_frame(&Render::batch(&renders, &device)?)?,
             codes: self.codes.codes(generator, &rows)?.detach(),
@@ -130,17 +125,18 @@ impl Pairs {
     }
 
     /// The render of a training portrait from its own camera.
-    fn render(&mut self, generator: &Generator, row: usize) -> Result<Render> {
-        if let Some(Some(render)) = self.renders.get(row) {
+    fn render(&mut self, generator: &Generator, place: usize) -> Result<Render> {
+        if let Some(Some(render)) = self.renders.get(place) {
             return Ok(render.clone());
         }
-        let codes = self.codes.codes(generator, &[row as u32])?;
-        let camera = self.portraits.camera(self.draws[row]).unwrap_or_default();
+        let picture = self.pictures[place];
+        let codes = self.codes.codes(generator, &[self.people.row(picture) as u32])?;
+        let camera = self.portraits.camera(picture).unwrap_or_default();
         let cameras = Camera::parameter_tensor(&[camera], &generator.device())?;
         let render = Render::of(&generator.render(&codes, &cameras, &settings(generator))?)?;
         if self.kept < MOST_KEPT {
             self.kept += 1;
-            self.renders[row] = Some(render.clone());
+            self.renders[place] = Some(render.clone());
         }
         Ok(render)
     }
