@@ -8,13 +8,16 @@ use crate::{
     error::{Error, Result},
     model::generator::Generator,
     region::REGION_COUNT,
-    render::{Frame, RenderSettings, TwoPass},
+    render::{Frame, RenderSettings},
     rng::Stream,
     train::{config::TrainConfig, people::People, portrait_codes::PortraitCodes, preview, team::Team, trainer::Inputs},
 };
 
 /// Renders of training portraits are kept up to this many; beyond it they are rendered each time they are needed.
 const MOST_KEPT: usize = 2_500;
+
+/// Largest error of a render, as of the command line's pictures.
+const BUDGET: f64 = 0.002;
 
 /// Training portraits with codes, and their renders.
 pub(super) struct Pairs {
@@ -142,9 +145,10 @@ impl Pairs {
     }
 }
 
-/// How renders are made for training: in two passes, a fraction of the time at an error the upsampler does not see.
+/// How renders are made for training: as those of finished portraits are. The field gets no gradient, so what a plan leaves
+/// out is bounded by the budget and is nothing else.
 pub(super) fn settings(generator: &Generator) -> RenderSettings {
-    RenderSettings { two_pass: Some(TwoPass::default()), ..generator.render_settings() }
+    RenderSettings { budget: BUDGET, ..generator.render_settings() }
 }
 
 /// A render as the upsampler reads it, f16: half the memory, and an error far below the renders' own.
