@@ -9,6 +9,18 @@ pub use cnerf_kernels::{FILM_LAYERS, SHAPE_LAYERS, SdfHead, TEXTURE_LAYERS};
 
 use crate::error::{Error, Result};
 
+/// Which networks make up the field.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Composition {
+    /// The paper: a local generator for every region, each driven by the region's own codes.
+    #[default]
+    Regions,
+    /// One network for the whole head with a mask output for every region, driven by one shape and one texture code,
+    /// those of the face, as in FENeRF (Sun et al. 2022): a baseline that no region can be edited in.
+    Single,
+}
+
 /// How local residuals join the global distance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -82,6 +94,9 @@ pub struct FilmConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FieldConfig {
+    /// Which networks make it up.
+    #[serde(default)]
+    pub composition: Composition,
     /// Length of one code row. Paper 256; recipe 128.
     pub style_dim: usize,
     /// Width of every local generator's layers. Paper 128; recipe 48; ours 64.
@@ -114,6 +129,7 @@ impl FieldConfig {
     /// The paper's form at the authors' sizes.
     pub fn paper() -> Self {
         Self {
+            composition: Composition::Regions,
             style_dim: 256,
             width: 128,
             film: FilmConfig { gamma_gain: 15.0, gamma_offset: 30.0, beta_gain: 0.25 },
@@ -157,6 +173,14 @@ impl FieldConfig {
             return refuse(
                 "mask_view_input",
                 "gated residuals need masks that do not depend on the view; set it to false",
+            );
+        }
+        let one_distance = self.residual == Residual::Gated && matches!(self.fusion, Fusion::Softmax { .. });
+        if self.composition == Composition::Single && !one_distance {
+            return refuse(
+                "composition",
+                "a single network has one distance and one colour; only gated residuals and softmax masks leave them as \
+                 they are",
             );
         }
         if !(self.alpha_initial > 0.0 && self.alpha_initial.is_finite()) {

@@ -1,5 +1,5 @@
 //! Measures: pixel and perceptual distances, mask agreement, how like real portraits random ones are, whether views
-//! agree, locality of edits.
+//! agree, locality of edits, separation of shape and texture.
 
 pub mod consistency;
 pub mod distribution;
@@ -8,6 +8,7 @@ pub mod locality;
 pub mod perceptual;
 pub mod quality;
 pub mod realism;
+pub mod separation;
 pub mod spectrum;
 pub mod subject;
 pub mod warp;

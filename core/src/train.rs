@@ -1,6 +1,7 @@
 //! Losses, the trainer and its checkpoints.
 
 pub mod adversarial;
+pub mod augment;
 pub mod average;
 pub mod checkpoint;
 pub mod config;

@@ -103,6 +103,12 @@ fn locality_measures_every_region_and_texture_moves_nothing() {
         assert_eq!(moves, number(row, "depth_change") > 0.0, "{row}");
         assert!(number(row, "outside_change") >= 0.0, "{row}");
     }
+    let separation = &report["separation"];
+    assert_eq!((number(&separation["texture"], "masks"), number(&separation["texture"], "depth")), (0.0, 0.0));
+    for key in ["masks", "depth", "colour", "region_colour", "features"] {
+        assert!(number(&separation["shape"], key) > 0.0, "{key}: {separation}");
+    }
+    assert!(number(&separation["texture"], "region_colour") > 0.0, "{separation}");
     let row = |region: &str, aspect: &str| rows.iter().find(|row| row["region"] == region && row["aspect"] == aspect);
     let hair = row("hair", "texture").unwrap();
     assert!(number(hair, "inside_change") > number(hair, "outside_change"), "{hair}");

@@ -149,6 +149,52 @@ fn a_dry_run_tells_configuration_time_and_memory_and_writes_nothing() {
     assert!(!folder.path("run").exists());
 }
 
+/// The labels of CelebAMask-HQ that stand for this program's nine regions.
+const CELEBAMASK: [u8; 9] = [0, 1, 4, 6, 10, 2, 8, 13, 17];
+
+#[test]
+fn the_papers_preset_on_an_ffhq_like_set_resolves_to_the_papers_numbers() {
+    let folder = Folder::with_model("ffhq");
+    for part in ["ffhq", "ffhq/images", "ffhq/masks"] {
+        std::fs::create_dir(folder.path(part)).unwrap();
+    }
+    for index in 0..5 {
+        let name = format!("{index:05}.png");
+        std::fs::copy(folder.path(DATA).join("images").join(&name), folder.path("ffhq/images").join(&name)).unwrap();
+        let mut mask = image::load_from_memory(&folder.read(&format!("{DATA}/masks/{name}"))).unwrap().to_luma8();
+        mask.pixels_mut().for_each(|pixel| pixel[0] = CELEBAMASK[usize::from(pixel[0])]);
+        mask.save(folder.path("ffhq/masks").join(&name)).unwrap();
+    }
+    let import = "dataset import --images ffhq/images --masks ffhq/masks --format celebamask-hq-19 --out data";
+    folder.run(import).done();
+    // The upsampler's stage is not tried without a trained field: nothing of the paper's size is computed here.
+    let told = folder.json("train --data data --out run --preset ffhq --stage upsampler --dry-run");
+    assert_eq!((number(&told, "portraits"), told["estimates"].as_array().map(Vec::len)), (5.0, Some(0)));
+    let config = &told["config"];
+    let (model, field, upsampler) = (&config["model"], &config["field"], &config["upsampler"]);
+    let is = |table: &serde_json::Value, expected: &[(&str, f64)]| {
+        for (key, value) in expected {
+            assert_eq!(number(table, key), *value, "{key} in {table}");
+        }
+    };
+    is(&model["field"], &[("width", 128.0), ("style_dim", 256.0)]);
+    is(model, &[("samples", 24.0)]);
+    assert_eq!(model["camera_deviation_rad"], serde_json::json!([0.3, 0.15]));
+    is(&model["upsampler"], &[("input_resolution", 64.0), ("output_resolution", 512.0)]);
+    is(field, &[("resolution", 64.0), ("samples", 24.0)]);
+    is(field, &[("generator_learning_rate", 2e-5), ("discriminator_learning_rate", 2e-4)]);
+    assert_eq!(field["betas"], serde_json::json!([0.0, 0.9]));
+    is(field, &[("r1_image", 10.0), ("r1_mask", 1000.0), ("semantic", 1.0), ("decoupling", 1.0)]);
+    is(field, &[("view", 15.0), ("eikonal", 0.1), ("minimal_surface", 0.001)]);
+    is(upsampler, &[("adversarial", 1.0), ("r1_image", 10.0), ("r1_mask", 1000.0), ("agreement", 0.0)]);
+    // What the paper does not have is off.
+    assert_eq!(number(&config["warmup"], "steps"), 0.0);
+    assert_eq!((number(field, "augment_target"), number(upsampler, "augment_target")), (0.0, 0.0));
+    for (key, form) in [("residual", "sum"), ("fusion", "raw"), ("background", "field"), ("density", "residual_sdf")] {
+        assert_eq!(model["field"][key], form);
+    }
+}
+
 #[test]
 fn several_processes_without_mpi_are_refused() {
     let folder = Folder::with_model("processes");

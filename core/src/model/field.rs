@@ -10,13 +10,13 @@ use crate::{
     camera::INPUT_SCALE,
     codes,
     config::{
-        Background, DensityKind, FILM_LAYERS, FieldConfig, FilmConfig, Fusion, InitialDistance, Residual, SHAPE_LAYERS,
-        SdfHead, TEXTURE_LAYERS,
+        Background, Composition, DensityKind, FILM_LAYERS, FieldConfig, FilmConfig, Fusion, InitialDistance, Residual,
+        SHAPE_LAYERS, SdfHead, TEXTURE_LAYERS,
     },
     error::{Error, Result},
     kernels::{HeadShape, Outputs, autograd},
     parameters::{Init, Parameters},
-    region::{REGION_COUNT, RegionSet},
+    region::{REGION_COUNT, Region, RegionSet},
     render::{
         BackgroundEvaluation, Evaluation, RadianceField, norm,
         plan::{LocalFeatures, LocalField, LocalInitial, LocalWeights},
@@ -65,6 +65,17 @@ impl Generators {
         })
     }
 
+    /// One generator's weights as those of every region: views, not copies, so that there is one set to learn.
+    fn for_all_regions(self) -> Result<Self> {
+        let pair =
+            |(weight, bias): (Tensor, Tensor)| Ok::<_, Error>((for_all_regions(weight)?, for_all_regions(bias)?));
+        Ok(Self {
+            layers: self.layers.into_iter().map(pair).collect::<Result<_>>()?,
+            film: pair(self.film)?,
+            residual: pair(self.residual)?,
+        })
+    }
+
     /// γ and β of every layer, `[B, k, 5, 2, W]`, from codes `[B, k, 2, D]`: shape rows drive the first three
     /// layers, texture rows the last two.
     fn film(&self, codes: &Tensor, config: &FilmConfig) -> Result<Tensor> {
@@ -100,6 +111,15 @@ impl Generators {
     }
 }
 
+/// `[1, …]` as `[9, …]`.
+fn for_all_regions(tensor: Tensor) -> Result<Tensor> {
+    let mut shape = tensor.dims().to_vec();
+    if let Some(first) = shape.first_mut() {
+        *first = REGION_COUNT;
+    }
+    Ok(tensor.broadcast_as(shape)?)
+}
+
 fn hidden_bound(width: usize) -> f64 {
     (6.0 / width as f64).sqrt() / 25.0
 }
@@ -131,10 +151,10 @@ impl Field {
     pub fn new(config: &FieldConfig, parameters: &Parameters) -> Result<Self> {
         config.validate()?;
         let width = config.width;
-        let head = |name: &str, outputs: usize, inputs: usize, weight: Init, bias: f64| -> Result<(Tensor, Tensor)> {
+        let head = |name: &str, (count, outputs): (usize, usize), inputs: usize, weight: Init, bias: f64| {
             let parameters = parameters.within(name);
-            let weight = parameters.get("weight", &[REGION_COUNT, outputs, inputs], weight)?;
-            Ok((weight, parameters.get("bias", &[REGION_COUNT, outputs], Init::Constant(bias))?))
+            let weight = parameters.get("weight", &[count, outputs, inputs], weight)?;
+            Ok::<_, Error>((weight, parameters.get("bias", &[count, outputs], Init::Constant(bias))?))
         };
         let uniform = Init::Uniform(hidden_bound(width));
         let seen = |sees: bool| if sees { width + 3 } else { width };
@@ -142,12 +162,25 @@ impl Field {
             InitialDistance::Network => Some(Generators::new(1, config, &parameters.within("initial"))?),
             InitialDistance::Sphere { .. } => None,
         };
+        let networks = match config.composition {
+            Composition::Regions => REGION_COUNT,
+            Composition::Single => 1,
+        };
+        let mut generators = Generators::new(networks, config, parameters)?;
+        let mut feature = head("feature", (networks, width), seen(config.feature_view_input), Init::Identity, 0.0)?;
+        let mut colour = head("colour", (networks, 3), width, uniform, 0.0)?;
+        if config.composition == Composition::Single {
+            generators = generators.for_all_regions()?;
+            for tensor in [&mut feature.0, &mut feature.1, &mut colour.0, &mut colour.1] {
+                *tensor = for_all_regions(tensor.clone())?;
+            }
+        }
         Ok(Self {
             config: config.clone(),
-            generators: Generators::new(REGION_COUNT, config, parameters)?,
-            mask: head("mask", 1, seen(config.mask_view_input), uniform, 1.0 / 8.0)?,
-            feature: head("feature", width, seen(config.feature_view_input), Init::Identity, 0.0)?,
-            colour: head("colour", 3, width, uniform, 0.0)?,
+            generators,
+            mask: head("mask", (REGION_COUNT, 1), seen(config.mask_view_input), uniform, 1.0 / 8.0)?,
+            feature,
+            colour,
             log_alpha: parameters.get("log_alpha", &[1], Init::Constant(config.alpha_initial.ln()))?,
             initial,
         })
@@ -169,15 +202,22 @@ impl Field {
         if style_dim != self.config.style_dim {
             return Err(Error::shape("codes", format!("[B, 9, 2, {}]", self.config.style_dim), codes.dims()));
         }
-        self.generators.film(codes, &self.config.film)
+        match self.config.composition {
+            Composition::Regions => self.generators.film(codes, &self.config.film),
+            Composition::Single => {
+                let code = codes.narrow(1, Region::Face.index(), 1)?.broadcast_as(codes.shape())?.contiguous()?;
+                self.generators.film(&code, &self.config.film)
+            }
+        }
     }
 
     /// The field of the portraits with these codes `[B, 9, 2, D]`. Differentiable in codes and weights.
     pub fn portraits(&self, codes: &Tensor) -> Result<PortraitField> {
         let film = self.film(codes)?;
         // Features are linear, so the colour head on top of them is one linear map of the last hidden layer.
-        let colour_weight = self.colour.0.matmul(&self.feature.0)?;
-        let colour_bias = (self.colour.0.matmul(&self.feature.1.unsqueeze(2)?)?.squeeze(2)? + &self.colour.1)?;
+        let colour = self.colour.0.contiguous()?;
+        let colour_weight = colour.matmul(&self.feature.0.contiguous()?)?;
+        let colour_bias = (colour.matmul(&self.feature.1.unsqueeze(2)?.contiguous()?)?.squeeze(2)? + &self.colour.1)?;
         let weights = self.generators.pack((&self.mask.0, &self.mask.1), (&colour_weight, &colour_bias))?;
         let regions = |first: usize, count: usize| -> Result<Kernel> {
             Ok(Kernel {

@@ -96,6 +96,8 @@ pub struct DiscriminatorLoss {
     pub r1_masks: Option<Tensor>,
     /// View or class.
     pub auxiliary: Option<Tensor>,
+    /// Verdicts on the real pictures, `[B, 1]`, detached.
+    pub real: Tensor,
 }
 
 /// Pictures and their masks as a discriminator takes them.
@@ -136,7 +138,8 @@ pub fn discriminator_loss(
     let (r1_image, r1_masks) = penalties.unzip();
     let total =
         [&r1_image, &r1_masks, &on_predictions].into_iter().flatten().try_fold(logistic.clone(), |a, b| a + b)?;
-    Ok(DiscriminatorLoss { total, logistic, r1_image, r1_masks, auxiliary: on_predictions })
+    let real = real.realness.detach();
+    Ok(DiscriminatorLoss { total, logistic, r1_image, r1_masks, auxiliary: on_predictions, real })
 }
 
 /// A generator's terms from one discriminator, and their weighted parts (scalars).

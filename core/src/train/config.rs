@@ -173,6 +173,13 @@ pub struct FieldStageConfig {
     pub decoupling: f64,
     /// Margin m of L_STD. The paper gives no number; ours 0.1, about a tenth of two portraits' feature distance.
     pub decoupling_margin: f64,
+    /// Share r_t of verdicts on real pictures, E[sign(D)], that adaptive augmentation holds the global discriminator to:
+    /// for sets of a few thousand pictures or fewer. ADA (Karras et al. 2020): 0.6; paper: 0, no augmentation.
+    #[serde(default)]
+    pub augment_target: f64,
+    /// Real pictures in which the chance of augmentation could rise from 0 to 1. ADA: 500,000.
+    #[serde(default)]
+    pub augment_ramp_images: usize,
     /// Chance that a step mixes two codes. StyleGAN: 0.9.
     pub mixing: f64,
     /// Pictures after which an old value counts half in the averaged weights. Authors: 10,000.
@@ -237,6 +244,12 @@ pub struct UpsamplerStageConfig {
     pub r1_mask: f64,
     /// Steps between R1 penalties. Authors: 16.
     pub r1_steps: usize,
+    /// As in the field's stage.
+    #[serde(default)]
+    pub augment_target: f64,
+    /// As in the field's stage.
+    #[serde(default)]
+    pub augment_ramp_images: usize,
     /// Weight of path-length regularisation (`StyleGan2` upsamplers only). Authors: 2; 0 trains without it.
     pub path_length: f64,
     /// Steps between path-length penalties. Authors: 4.
@@ -372,6 +385,8 @@ impl TrainConfig {
             semantic: 1.0,
             decoupling: 1.0,
             decoupling_margin: 0.1,
+            augment_target: 0.0,
+            augment_ramp_images: 500_000,
             mixing: 0.9,
             average_half_life_images: 10_000.0,
         }
@@ -403,6 +418,8 @@ impl TrainConfig {
             r1_image: 10.0,
             r1_mask: 1_000.0,
             r1_steps: 16,
+            augment_target: 0.0,
+            augment_ramp_images: 500_000,
             path_length: 2.0,
             path_length_steps: 4,
             average_half_life_images: 10_000.0,
@@ -470,6 +487,17 @@ impl TrainConfig {
         positive("upsampler.crop", self.upsampler.crop)?;
         if !(1.0..=4.0).contains(&self.upsampler.perceptual_zoom) {
             return Err(Error::config("upsampler.perceptual_zoom", "must be between 1 and 4"));
+        }
+        for (stage, target, images) in [
+            ("field", self.field.augment_target, self.field.augment_ramp_images),
+            ("upsampler", self.upsampler.augment_target, self.upsampler.augment_ramp_images),
+        ] {
+            if !(0.0..1.0).contains(&target) {
+                return Err(Error::config(format!("{stage}.augment_target"), "must be at least 0 and below 1"));
+            }
+            if target > 0.0 {
+                positive(&format!("{stage}.augment_ramp_images"), images)?;
+            }
         }
         positive("keep_checkpoints", self.keep_checkpoints)?;
         positive("checkpoint_steps", self.checkpoint_steps)?;

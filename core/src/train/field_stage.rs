@@ -24,6 +24,7 @@ use crate::{
     rng::Stream,
     train::{
         adversarial::{Auxiliary, Pictures, R1Weights, discriminator_loss, generator_terms},
+        augment::{Augmenter, Purpose},
         average::Average,
         config::{FieldStageConfig, TrainConfig},
         events::Metrics,
@@ -59,6 +60,8 @@ pub struct FieldStage {
     /// The same two, for the generator's step: gradients of their weights would take as much memory as the weights.
     judges: Judges,
     discriminators: Parameters,
+    /// Of both discriminators; the global one's verdicts move it.
+    augmenter: Augmenter,
     generator_optimiser: Adam,
     discriminator_optimiser: Adam,
 }
@@ -137,6 +140,7 @@ impl FieldStage {
             perceptual: inputs.perceptual.clone(),
             portrait_codes: start.and_then(|start| start.portrait_codes.clone()),
             average: Average::of(generator.parameters(), stage.average_half_life_images)?,
+            augmenter: Augmenter::new(stage.augment_target, stage.augment_ramp_images, config.seed, &inputs.team),
             config: stage,
             seed: config.seed,
             device: inputs.device.clone(),
@@ -212,17 +216,21 @@ impl FieldStage {
         })
     }
 
-    /// The discriminators' whole loss at `step`.
-    fn discriminators_loss(&self, real: &Batch, step: usize, metrics: &mut Metrics) -> Result<Tensor> {
+    /// The discriminators' whole loss at `step`, and the global one's verdicts on the real pictures.
+    fn discriminators_loss(&self, real: &Batch, step: usize, metrics: &mut Metrics) -> Result<(Tensor, Tensor)> {
         let level = real.at(self.config.resolution)?;
         let here = |tensor: &Tensor| tensor.to_device(&self.device)?.to_dtype(self.dtype);
         let (real_image, real_masks) = (here(&level.images)?, here(&level.masks)?);
+        let pictures = Pictures { image: &real_image, masks: &real_masks };
+        let (real_image, real_masks) = self.augmenter.apply(step, Purpose::Real, pictures)?;
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 0]);
         let codes = self.draw_codes(&mut random)?;
         let cameras = self.draw_cameras(&mut random);
         let outputs = Outputs { colour: true, ..Outputs::default() };
         let fakes = self.render(&codes.detach(), &cameras, outputs, &mut random)?;
         let (fake_image, fake_masks) = (fakes.image.detach(), fakes.masks.detach());
+        let pictures = Pictures { image: &fake_image, masks: &fake_masks };
+        let (fake_image, fake_masks) = self.augmenter.apply(step, Purpose::Fake, pictures)?;
         let penalty = R1Weights { image: self.config.r1_image, masks: self.config.r1_mask };
         let loss = discriminator_loss(
             &self.global,
@@ -232,7 +240,7 @@ impl FieldStage {
             Some(penalty),
         )?;
         metrics.push_loss("global", &loss.logistic)?;
-        let mut total = loss.total;
+        let (mut total, verdicts) = (loss.total, loss.real);
         if self.config.semantic > 0.0 {
             let regions = self.share().pick(&draw_regions(self.whole_batch(), &mut random));
             let labels = class_labels(&regions, &self.device)?;
@@ -247,7 +255,7 @@ impl FieldStage {
             total = (total + loss.total)?;
         }
         metrics.check_finite()?;
-        Ok(total)
+        Ok((total, verdicts))
     }
 
     /// The gradients of the generator's whole loss at `step`; its terms join `metrics`. Errs if one is not finite.
@@ -256,7 +264,7 @@ impl FieldStage {
     /// before L_STD renders its four.
     pub(crate) fn generator_gradients(&self, step: usize, metrics: &mut Metrics) -> Result<GradStore> {
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
-        let mut gradients = self.portrait_loss(&mut random, metrics)?.backward()?;
+        let mut gradients = self.portrait_loss(step, &mut random, metrics)?.backward()?;
         if self.config.decoupling > 0.0 {
             let more = self.weighted_decoupling(&mut random, metrics)?.backward()?;
             for (_, variable) in self.generator.parameters().variables() {
@@ -280,13 +288,15 @@ impl FieldStage {
     }
 
     /// All of the generator's loss but L_STD: one portrait before the discriminators, and its surface.
-    fn portrait_loss(&self, random: &mut Stream, metrics: &mut Metrics) -> Result<Tensor> {
+    fn portrait_loss(&self, step: usize, random: &mut Stream, metrics: &mut Metrics) -> Result<Tensor> {
         let config = &self.config;
         let codes = self.draw_codes(random)?;
         let cameras = self.draw_cameras(random);
         let outputs = Outputs { colour: true, gradient: true, ..Outputs::default() };
         let fakes = self.render(&codes, &cameras, outputs, random)?;
-        let mut total = through([&fakes.image, &fakes.masks], |[image, masks]| {
+        let pictures = Pictures { image: &fakes.image, masks: &fakes.masks };
+        let (image, masks) = self.augmenter.apply(step, Purpose::Generator, pictures)?;
+        let mut total = through([&image, &masks], |[image, masks]| {
             let view = Auxiliary::View { angles_rad: &fakes.angles_rad, weight: config.view };
             let terms = generator_terms(&self.judges.global, Pictures { image, masks }, view)?;
             metrics.push_loss("generator", &terms.adversarial)?;
@@ -295,8 +305,8 @@ impl FieldStage {
         if config.semantic > 0.0 {
             let regions = self.share().pick(&draw_regions(self.whole_batch(), random));
             let labels = class_labels(&regions, &self.device)?;
-            let masks = select_masks(&fakes.masks, &regions)?;
-            let loss = through([&fakes.image, &masks], |[image, masks]| {
+            let masks = select_masks(&masks, &regions)?;
+            let loss = through([&image, &masks], |[image, masks]| {
                 let class = Auxiliary::Class { labels: &labels, weight: 1.0 };
                 let terms = generator_terms(&self.judges.semantic, Pictures { image, masks }, class)?;
                 metrics.push_loss("generator_semantic", &terms.adversarial)?;
@@ -354,9 +364,10 @@ impl StageRun for FieldStage {
     fn step(&mut self, step: usize) -> Result<Metrics> {
         let mut metrics = Metrics::default();
         let real = self.real(step)?;
-        let loss = self.discriminators_loss(&real, step, &mut metrics)?;
+        let (loss, verdicts) = self.discriminators_loss(&real, step, &mut metrics)?;
         let norms = self.discriminator_optimiser.step(&loss.backward()?, 1.0)?;
         metrics.push("discriminator_norm", norms.iter().sum());
+        self.augmenter.adapt(&verdicts, &mut metrics)?;
         let gradients = self.generator_gradients(step, &mut metrics)?;
         let norms = self.generator_optimiser.step(&gradients, 1.0)?;
         metrics.push("generator_norm", norms.iter().sum());
@@ -368,6 +379,7 @@ impl StageRun for FieldStage {
         tensors.extend(self.generator.parameters().snapshot()?);
         tensors.extend(self.discriminators.snapshot()?);
         self.average.save(tensors);
+        self.augmenter.save(tensors)?;
         self.generator_optimiser.save("adam_generator", tensors)?;
         self.discriminator_optimiser.save("adam_discriminator", tensors)
     }
@@ -376,6 +388,7 @@ impl StageRun for FieldStage {
         self.generator.parameters().restore(tensors)?;
         self.discriminators.restore(tensors)?;
         self.average.load(tensors)?;
+        self.augmenter.load(tensors)?;
         self.generator_optimiser.load("adam_generator", tensors)?;
         self.discriminator_optimiser.load("adam_discriminator", tensors)
     }
@@ -500,10 +513,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let ours = stage(&folder.path().join("ours"), |_| ());
         let theirs = stage(&folder.path().join("paper"), paper);
-        for (form, mut stage) in [("ours", ours), ("paper", theirs)] {
+        let mut augmented = stage(&folder.path().join("augmented"), |_| ());
+        augmented.augmenter = Augmenter::new(0.6, 100, 7, &Team::default()).with_probability(0.8);
+        for (form, mut stage) in [("ours", ours), ("paper", theirs), ("augmented", augmented)] {
             let real = stage.real(0).unwrap();
             let value = |loss: Tensor| loss.to_scalar::<f64>().unwrap();
-            let discriminators = || stage.discriminators_loss(&real, 0, &mut Metrics::default()).unwrap();
+            let discriminators = || stage.discriminators_loss(&real, 0, &mut Metrics::default()).unwrap().0;
             let gradients = discriminators().backward().unwrap();
             let variables = stage.discriminators.variables();
             check(&format!("{form}, discriminators"), variables, &gradients, || value(discriminators()));
@@ -514,11 +529,50 @@ mod tests {
             }
             let generator = || {
                 let mut random = Stream::new(stage.seed, &[STREAM, 0, 1]);
-                let portrait = stage.portrait_loss(&mut random, &mut Metrics::default()).unwrap();
+                let portrait = stage.portrait_loss(0, &mut random, &mut Metrics::default()).unwrap();
                 value(portrait) + value(stage.weighted_decoupling(&mut random, &mut Metrics::default()).unwrap())
             };
             let variables = stage.generator.parameters().variables();
             check(&format!("{form}, generator"), variables, &gradients, generator);
         }
+    }
+
+    #[test]
+    fn augmentation_rises_and_a_stop_changes_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let portraits = dataset(folder.path(), 6);
+        let stage = || {
+            let settings = ["field.augment_target=0.01", "field.augment_ramp_images=20", "field.decoupling=0"];
+            let config = TrainConfig::preset(Preset::Tiny).with(&settings.map(str::to_owned)).unwrap();
+            let inputs = Inputs {
+                dataset: Arc::clone(&portraits),
+                perceptual: None,
+                start: None,
+                device: Device::Cpu,
+                team: Team::default(),
+            };
+            let mut stage = FieldStage::with_type(&config, &inputs, None, DType::F32).unwrap();
+            // p moves only after four steps: enough of it from the start that pictures change.
+            stage.augmenter = stage.augmenter.with_probability(0.5);
+            stage
+        };
+        let state = |stage: &FieldStage| {
+            let mut tensors = Tensors::new();
+            stage.save(&mut tensors).unwrap();
+            let numbers = |tensor: &Tensor| tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();
+            tensors.values().flat_map(|tensor| numbers(tensor).unwrap()).collect::<Vec<f64>>()
+        };
+        let mut whole = stage();
+        (0..4).for_each(|step| drop(whole.step(step).unwrap()));
+        let metrics = whole.step(4).unwrap();
+        assert!(metrics.get("augment_probability").is_some_and(|p| p != 0.5), "{metrics:?}");
+        let mut first = stage();
+        (0..2).for_each(|step| drop(first.step(step).unwrap()));
+        let mut saved = Tensors::new();
+        first.save(&mut saved).unwrap();
+        let mut second = stage();
+        second.load(&saved).unwrap();
+        (2..5).for_each(|step| drop(second.step(step).unwrap()));
+        assert!(state(&second) == state(&whole), "a stop changed what was learnt");
     }
 }

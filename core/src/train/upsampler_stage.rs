@@ -448,11 +448,19 @@ mod tests {
         let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=1", "random_portraits=2"];
         let criticised = vec!["critic=0.1", "discriminator_ahead_steps=1", "random_portraits=1"];
         let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
+        let augmented = vec![
+            "adversarial=0.1",
+            "discriminator_ahead_steps=0",
+            "random_portraits=0",
+            "augment_target=0.01",
+            "augment_ramp_images=20",
+        ];
         for (settings, quantities) in [
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
             (alone, &["discriminator", "adversarial"][..]),
             (criticised, &["pixels", "perceptual", "critic", "criticised"][..]),
             (agreeing, &["pixels", "discriminator", "adversarial", "agreement"][..]),
+            (augmented, &["adversarial", "real_sign", "augment_probability"][..]),
         ] {
             let mut whole = stage(&portraits, &settings);
             let before = state(&whole);

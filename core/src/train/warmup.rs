@@ -74,10 +74,6 @@ impl Warmup {
     /// Decodes the dataset and sets the codes to the portraits' whitened coordinates.
     pub fn new(config: &TrainConfig, inputs: &Inputs, start: Option<&Start>) -> Result<Self> {
         let stage = config.warmup.clone();
-        if config.model.field.background != Background::FarPlane {
-            let reason = "the warm-up ties the background to the far plane; set it to \"far_plane\"";
-            return Err(Error::config("model.field.background", reason));
-        }
         let mut resolutions = vec![CODE_RESOLUTION, stage.resolutions[0], stage.resolutions[1]];
         resolutions.sort_unstable();
         resolutions.dedup();
@@ -239,8 +235,14 @@ impl Warmup {
 
         let colour = losses::colour_l1(&output.colour, &batch.colours)?;
         let masks = losses::masks_l2(&output.masks, &batch.masks, &MASK_WEIGHTS)?;
-        let foreground = batch.masks.narrow(1, 0, 1)?.squeeze(1)?.affine(-1.0, 1.0)?;
-        let opacity = losses::opacity(&output.weights.remaining.affine(-1.0, 1.0)?, &foreground)?;
+        // Where the background is a region of the volume, nothing is left behind it, and its mask says the same.
+        let opacity = match self.background() {
+            Background::FarPlane => {
+                let foreground = batch.masks.narrow(1, 0, 1)?.squeeze(1)?.affine(-1.0, 1.0)?;
+                losses::opacity(&output.weights.remaining.affine(-1.0, 1.0)?, &foreground)?
+            }
+            Background::Field => Tensor::zeros((), DType::F32, &self.device)?,
+        };
         let minimal_surface = losses::minimal_surface(&output.evaluation.distance, MINIMAL_SURFACE_SHARPNESS)?;
         let colours =
             output.evaluation.colours.as_ref().ok_or_else(|| Error::config("fill", "the field gave no colours"))?;
@@ -294,7 +296,14 @@ impl Warmup {
         Ok((chosen + (noise * EIKONAL_SPREAD)?)?)
     }
 
+    fn background(&self) -> Background {
+        self.generator.config().field.background
+    }
+
     fn sampling(&self) -> Sampling {
+        if self.background() == Background::Field {
+            return Sampling::closed(self.config.samples);
+        }
         let [near, far] = self.config.depth_range;
         let samples = self.config.samples;
         Sampling {

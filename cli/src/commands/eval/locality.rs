@@ -1,9 +1,12 @@
-//! `cnerf eval locality`: whether edits stay in their region.
+//! `cnerf eval locality`: whether edits stay in their region, and shape and texture apart.
 
 use clap::Args;
 use cnerf_core::{
     codes::Aspect,
-    eval::locality::{Locality, summary as gather, swap_each},
+    eval::{
+        locality::{Locality, summary as gather, swap_each},
+        separation::{self, Carried, Separation, swap_all},
+    },
     interop::chart::{Axis, BarChart},
     region::Region,
 };
@@ -30,6 +33,8 @@ struct Report {
     regions: Vec<Locality>,
     /// The largest depth change of any texture edit, world units.
     texture_depth_change: f64,
+    /// What swapping all shape codes, or all texture codes, changes.
+    separation: Separation,
     seconds: f64,
 }
 
@@ -44,9 +49,13 @@ impl LocalityArguments {
             portraits.described()
         ));
         let bar = console.bar(portraits.len() as u64, "locality");
-        let mut changes = Vec::new();
+        let (mut changes, mut swaps) = (Vec::new(), Vec::new());
         for index in 0..portraits.len() {
-            changes.push(portraits.visit(index, |subject, donor| Ok(swap_each(subject, donor)?))?.1);
+            let measure =
+                portraits.visit(index, |subject, donor| Ok((swap_each(subject, donor)?, swap_all(subject, donor)?)));
+            let (_, (change, swap)) = measure?;
+            changes.push(change);
+            swaps.push(swap);
             bar.inc(1);
         }
         bar.finish_and_clear();
@@ -54,8 +63,13 @@ impl LocalityArguments {
         draw(&self.plots, &regions)?;
         let of_texture = regions.iter().filter(|found| found.aspect == Aspect::Texture);
         let texture_depth_change = of_texture.map(|found| found.largest_depth_change).fold(0.0, f64::max);
-        let report =
-            Report { count: changes.len(), regions, texture_depth_change, seconds: began.elapsed().as_secs_f64() };
+        let report = Report {
+            count: changes.len(),
+            regions,
+            texture_depth_change,
+            separation: separation::summary(&swaps),
+            seconds: began.elapsed().as_secs_f64(),
+        };
         console.result(&report, || summary(&report))?;
         Ok(Outcome::Done)
     }
@@ -114,5 +128,23 @@ fn summary(report: &Report) -> String {
             shown(found.outside_depth_change, 6),
         )
     }));
+    lines.push(String::new());
+    lines.push(format!(
+        "{:<21} {:>7} {:>7} {:>7} {:>13} {:>8}",
+        "share of both swapped", "masks", "depth", "colour", "region colour", "features"
+    ));
+    for (name, carried) in
+        [("all shape codes", report.separation.shape), ("all texture codes", report.separation.texture)]
+    {
+        let Carried { masks, depth, colour, region_colour, features } = carried;
+        lines.push(format!(
+            "{name:<21} {:>7} {:>7} {:>7} {:>13} {:>8}",
+            shown(masks, 3),
+            shown(depth, 3),
+            shown(colour, 3),
+            shown(region_colour, 3),
+            shown(features, 3)
+        ));
+    }
     lines.join("\n")
 }

@@ -26,6 +26,7 @@ fn forms() -> Vec<FieldConfig> {
         FieldConfig { initial_distance: InitialDistance::Network, ..paper.clone() },
         FieldConfig { density: DensityKind::Sdf, ..paper.clone() },
         FieldConfig { density: DensityKind::Density, ..ours.clone() },
+        FieldConfig { composition: Composition::Single, ..ours.clone() },
         ours,
         paper,
     ]
@@ -263,4 +264,42 @@ fn gradients_of_pictures_match_finite_differences() {
             }
         }
     }
+}
+
+#[test]
+fn a_single_network_has_one_distance_one_colour_and_the_faces_codes() {
+    let ours = config(FieldConfig { composition: Composition::Single, ..FieldConfig::ours() });
+    let parameters = Parameters::fresh(4, DType::F64, &Device::Cpu);
+    let field = Field::new(&ours, &parameters).unwrap();
+    let (first, points) = (codes(1, 1, DType::F64), points(1, 7, DType::F64));
+    let evaluate = |codes: &Tensor| field.portraits(codes).unwrap().evaluate(&points, None, ALL).unwrap();
+    let whole = evaluate(&first);
+    // Between regions only masks differ, so fusing changes nothing.
+    let region = |tensor: &Tensor, region: usize| tensor.narrow(1, region, 1).unwrap().contiguous().unwrap();
+    let colours = whole.colours.as_ref().unwrap();
+    assert_eq!(difference(&region(&whole.residuals, 0), &region(&whole.residuals, 6)), 0.0);
+    assert_eq!(difference(&region(colours, 0), &region(colours, 6)), 0.0);
+    assert!(difference(&region(&whole.masks, 0), &region(&whole.masks, 6)) > 1e-6);
+    let sphere = (norm(&points).unwrap() - 0.06).unwrap();
+    let distance = (region(&whole.residuals, 0).squeeze(1).unwrap() + sphere).unwrap();
+    assert!(difference(&whole.distance, &distance) < 1e-12);
+    let swapped = |region: Region| {
+        let other = codes(1, 2, DType::F64);
+        difference(
+            &evaluate(&blend(&first, &other, region.into(), Aspect::Shape, 1.0).unwrap()).distance,
+            &whole.distance,
+        )
+    };
+    assert_eq!(swapped(Region::Hair), 0.0);
+    assert!(swapped(Region::Face) > 0.0);
+    // One set of weights learns from all regions.
+    let loss = (whole.distance.sqr().unwrap().sum_all().unwrap() + colours.sqr().unwrap().sum_all().unwrap()).unwrap();
+    let gradients = loss.backward().unwrap();
+    let variable = |name: &str| parameters.variables().into_iter().find(|(known, _)| known == name).unwrap().1;
+    for name in ["weight1", "film.weight", "residual.weight", "feature.weight", "colour.weight"] {
+        assert_eq!(variable(name).dim(0).unwrap(), 1, "{name}");
+        assert!(gradients.get(&variable(name)).is_some_and(|gradient| largest(gradient) > 0.0), "{name}");
+    }
+    let sum = FieldConfig { residual: Residual::Sum, ..ours };
+    assert!(Field::new(&sum, &Parameters::fresh(4, DType::F64, &Device::Cpu)).is_err());
 }

@@ -19,6 +19,7 @@ use crate::{
     rng::Stream,
     train::{
         adversarial::{Auxiliary, Pictures, R1Weights, discriminator_loss, generator_terms},
+        augment::{Augmenter, Purpose},
         config::{TrainConfig, UpsamplerStageConfig},
         events::Metrics,
         optimiser::{Adam, Betas, Group},
@@ -31,6 +32,7 @@ pub(super) struct Adversary {
     discriminator: Discriminator,
     parameters: Parameters,
     optimiser: Adam,
+    augmenter: Augmenter,
     photos: Option<Photos>,
 }
 
@@ -63,6 +65,12 @@ impl Judged {
         let masks = square.of(&self.masks, 1)?;
         let masks = if hard_masks { hard(&masks)? } else { masks };
         Ok(Self { image: square.of(&self.image, 1)?, masks })
+    }
+
+    /// The same as the discriminator is shown them.
+    fn augmented(&self, augmenter: &Augmenter, step: usize, purpose: Purpose) -> Result<Self> {
+        let (image, masks) = augmenter.apply(step, purpose, Pictures { image: &self.image, masks: &self.masks })?;
+        Ok(Self { image, masks })
     }
 }
 
@@ -97,7 +105,9 @@ impl Adversary {
             learning_rate: stage.discriminator_learning_rate,
             largest_gradient_norm: None,
         };
-        Ok(Self { optimiser: Adam::new(vec![group], betas).in_team(&inputs.team), discriminator, parameters, photos })
+        let optimiser = Adam::new(vec![group], betas).in_team(&inputs.team);
+        let augmenter = Augmenter::new(stage.augment_target, stage.augment_ramp_images, config.seed, &inputs.team);
+        Ok(Self { discriminator, parameters, optimiser, augmenter, photos })
     }
 
     /// The photos of a step, for a run without pairs.
@@ -131,7 +141,8 @@ impl Adversary {
             let square = Square::random(side, pictures.image.dim(2)?, random);
             pictures.seen(square, config.hard_masks)
         });
-        let (real, fake) = (real?, fake?);
+        let real = real?.augmented(&self.augmenter, step, Purpose::Real)?;
+        let fake = fake?.augmented(&self.augmenter, step, Purpose::Fake)?;
         let (image, masks) = (fake.image.detach(), fake.masks.detach());
         let weights = R1Weights { image: config.r1_image, masks: config.r1_mask };
         let penalty = step.is_multiple_of(config.r1_steps.max(1)).then(|| weights.every(config.r1_steps.max(1)));
@@ -145,6 +156,7 @@ impl Adversary {
         metrics.push_loss("discriminator", &loss.logistic)?;
         metrics.check_finite()?;
         self.optimiser.step(&loss.total.backward()?, 1.0)?;
+        self.augmenter.adapt(&loss.real, metrics)?;
         if step < config.discriminator_ahead_steps {
             return Ok(None);
         }
@@ -154,15 +166,17 @@ impl Adversary {
         Ok(Some((terms.total * config.adversarial)?))
     }
 
-    /// Adds weights and optimiser to a checkpoint.
+    /// Adds weights, optimiser and augmentation to a checkpoint.
     pub fn save(&self, tensors: &mut Tensors) -> Result<()> {
         tensors.extend(self.parameters.snapshot()?);
+        self.augmenter.save(tensors)?;
         self.optimiser.save("adam_discriminator", tensors)
     }
 
     /// Reads what [`Self::save`] added.
     pub fn load(&mut self, tensors: &Tensors) -> Result<()> {
         self.parameters.restore(tensors)?;
+        self.augmenter.load(tensors)?;
         self.optimiser.load("adam_discriminator", tensors)
     }
 }
