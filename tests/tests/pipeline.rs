@@ -156,11 +156,11 @@ const CELEBAMASK: [u8; 9] = [0, 1, 4, 6, 10, 2, 8, 13, 17];
 fn the_papers_preset_on_an_ffhq_like_set_resolves_to_the_papers_numbers() {
     let folder = Folder::with_model("ffhq");
     for part in ["ffhq", "ffhq/images", "ffhq/masks"] {
-        std::fs::create_dir(folder.path(part)).unwrap();
+        fs::create_dir(folder.path(part)).unwrap();
     }
     for index in 0..5 {
         let name = format!("{index:05}.png");
-        std::fs::copy(folder.path(DATA).join("images").join(&name), folder.path("ffhq/images").join(&name)).unwrap();
+        fs::copy(folder.path(DATA).join("images").join(&name), folder.path("ffhq/images").join(&name)).unwrap();
         let mut mask = image::load_from_memory(&folder.read(&format!("{DATA}/masks/{name}"))).unwrap().to_luma8();
         mask.pixels_mut().for_each(|pixel| pixel[0] = CELEBAMASK[usize::from(pixel[0])]);
         mask.save(folder.path("ffhq/masks").join(&name)).unwrap();

@@ -155,7 +155,8 @@ mod tests {
 
     fn separation(sdf_head: SdfHead) -> Separation {
         let field = FieldConfig { style_dim: 8, width: 8, sdf_head, ..FieldConfig::ours() };
-        let config = GeneratorConfig { field, upsampler: None, camera_deviation_rad: [0.3, 0.15], samples: 6 };
+        let config =
+            GeneratorConfig { field, upsampler: None, camera_deviation_rad: [0.3, 0.15], samples: 6, population: 0 };
         let generator = Generator::new(&config, &Parameters::fresh(2, DType::F32, &Device::Cpu)).unwrap();
         let swaps: Vec<Swaps> = (0..2)
             .map(|seed| {
