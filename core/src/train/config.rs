@@ -79,7 +79,7 @@ pub struct WarmupConfig {
     pub rays: usize,
     /// Samples a ray.
     pub samples: usize,
-    /// Depths between which samples are placed.
+    /// Depths between which samples are placed; the whole of every ray where the background is a region of the volume.
     pub depth_range: [f64; 2],
     /// Learning rate of field, FiLM and mapping.
     pub learning_rate: f64,

@@ -112,6 +112,7 @@ fn ours(options: &Options) -> TrainConfig {
     let (half, whole) = (options.size / 2, options.size);
     let warmup = &mut config.warmup;
     (warmup.steps, warmup.resolutions) = (options.warmup_steps, [half, whole]);
+    (warmup.batch, warmup.rays, warmup.samples) = (16, 32, 8);
     (warmup.learning_rate, warmup.code_learning_rate) = (2e-3, 1e-2);
     warmup.schedule.warmup_steps = 30;
     let field = &mut config.field;
