@@ -13,7 +13,6 @@ use cnerf_core::{
     data::{labels::LabelMap, picture},
     eval::{
         consistency::correlation,
-        perceptual::Perceptual,
         quality::{self, Agreement},
         warp::{Raster, Surface},
     },
@@ -33,6 +32,7 @@ use crate::{
     error::Result,
     events::Event,
     inverter::{Inverter, Opened},
+    likeness::Likeness,
     parser::RegionParser,
     portrait::Portrait,
     start::NearStart,
@@ -45,9 +45,9 @@ use crate::{
 pub enum Variant {
     /// Codes and camera alone; the model stays as it is.
     Pivot,
-    /// Pivotal tuning as published: every layer at one rate, nothing holds depth at other views.
+    /// Pivotal tuning as published: every layer at one rate, nothing holds the geometry at other views.
     Plain,
-    /// Tuning with slow geometry and depth held at other views.
+    /// Tuning with slow geometry, depth and masks held at other views.
     #[default]
     Ours,
 }
@@ -59,7 +59,7 @@ impl Variant {
         match self {
             Self::Pivot => config.tune_steps = Some(0),
             Self::Plain => {
-                config.tune.depth = 0.0;
+                (config.tune.depth, config.tune.masks) = (0.0, 0.0);
                 config.tune.geometry_rate = config.tune.texture_rate;
             }
             Self::Ours => {}
@@ -95,8 +95,8 @@ pub struct EvaluationOptions {
 /// What people are inverted with beside the model.
 #[derive(Clone, Copy, Default)]
 pub struct Helpers<'a> {
-    /// Adds a perceptual loss and the LPIPS metric.
-    pub perceptual: Option<&'a Perceptual>,
+    /// Adds a perceptual loss, and the LPIPS metric if it is that.
+    pub likeness: Option<&'a Likeness>,
     /// Finds regions and head pose, unless the inverter is told them.
     pub parser: Option<&'a dyn RegionParser>,
     /// Finds first codes.
@@ -171,8 +171,7 @@ pub fn invert_one(
     let steps = config.steps();
     // What was read of other views is no part of inverting a photo, but as nothing beside the optimisation.
     let started = Instant::now();
-    let mut inverter =
-        Inverter::new(generator, &options.model_name, person.subject.clone(), config, helpers.perceptual)?;
+    let mut inverter = Inverter::new(generator, &options.model_name, person.subject.clone(), config, helpers.likeness)?;
     let (mut done, mut curve) = (0, Vec::new());
     while let Some(event) = inverter.step()? {
         if let Event::Pivot(report) | Event::Tune(report) = event {
@@ -325,7 +324,8 @@ mod tests {
         assert!(score.depth_correlation.is_some_and(|found| (-1.0..=1.0).contains(&found)), "{score:?}");
         let pivot = EvaluationOptions { variant: Variant::Pivot, ..options };
         let mut count = 0;
-        let (again, _) = invert_one(&generator, &people, 0, Helpers::default(), &pivot, &mut |_, _| count += 1).unwrap();
+        let (again, _) =
+            invert_one(&generator, &people, 0, Helpers::default(), &pivot, &mut |_, _| count += 1).unwrap();
         assert_eq!((count, again.depth_drift), (3, 0.0));
 
         let summary = InversionSummary::of(&[score.clone(), again.clone()], 1);
@@ -339,7 +339,7 @@ mod tests {
         assert_eq!(Variant::Ours.apply(config.clone()), config);
         assert_eq!(Variant::Pivot.apply(config.clone()).steps().tune, 0);
         let plain = Variant::Plain.apply(config);
-        assert_eq!((plain.tune.depth, plain.tune.geometry_rate), (0.0, plain.tune.texture_rate));
+        assert_eq!((plain.tune.depth, plain.tune.masks, plain.tune.geometry_rate), (0.0, 0.0, plain.tune.texture_rate));
     }
 
     #[test]

@@ -68,7 +68,7 @@ fn portraits_of_one_model_blend_and_others_are_told_apart() {
     let tiny = format!("train --data {DATA} --preset tiny --seed 2 --quiet --stage upsampler");
     folder.run(&format!("{tiny} --model {MODEL} --set upsampler.steps=1 --out other")).done();
     let few = "--aligned --pivot-steps 2 --tune-steps 0 --overwrite --out .";
-    std::fs::copy(folder.path("a.png"), folder.path("c.png")).unwrap();
+    std::fs::copy(folder.path(DATA).join("images/00000.png"), folder.path("c.png")).unwrap();
     folder.run(&format!("invert c.png --model other/model.safetensors {few}")).done();
     refused(&folder, "render a.cnerf c.cnerf --frames 3 --out x", &["a.cnerf", "c.cnerf", "different models"]);
 }
@@ -80,9 +80,8 @@ fn layers_stand_side_by_side() {
     folder.json(&format!("{line} --output rgb,seg,depth,normal --out all.png"));
     let all = folder.picture("all.png");
     assert_eq!(all.dimensions(), (4 * MODEL_SIZE, MODEL_SIZE));
-    let layers = [0, 1, 2, 3].map(|layer| {
-        imageops::crop_imm(&all, layer * MODEL_SIZE, 0, MODEL_SIZE, MODEL_SIZE).to_image()
-    });
+    let layers =
+        [0, 1, 2, 3].map(|layer| imageops::crop_imm(&all, layer * MODEL_SIZE, 0, MODEL_SIZE, MODEL_SIZE).to_image());
     for (index, layer) in layers.iter().enumerate() {
         assert!(has_content(layer) && !layers[..index].contains(layer), "layer {index}");
     }

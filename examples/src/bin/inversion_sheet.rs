@@ -12,14 +12,14 @@ use anyhow::{Context as _, Result, bail};
 use candle_core::{Device, Tensor};
 use clap::Parser;
 use cnerf_core::{
-    camera::Camera, codes::Aspect, data::picture, eval::perceptual::Perceptual, interop::sheet::Sheet,
-    model::generator::Generator, region::RegionSet,
+    camera::Camera, codes::Aspect, data::picture, interop::sheet::Sheet, model::generator::Generator, region::RegionSet,
 };
 use cnerf_invert::{
     config::InvertConfig,
     edit::{self, Change, Edit, Goal, Source},
     evaluation::{EvaluationOptions, Helpers, People},
     inverter::{Inverter, Opened},
+    likeness::Likeness,
     parser::ParserConfig,
     portrait::{Deltas, Portrait},
     start::NearStart,
@@ -115,7 +115,7 @@ impl Arguments {
 
     /// Everybody with a portrait; those who cannot be inverted are told and left out.
     fn people(&self, model: &Generator, people: &People) -> Result<Vec<Person>> {
-        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &Device::Cpu)).transpose()?;
+        let likeness = Likeness::load(self.lpips.as_deref(), cnerf_models::parser(), &Device::Cpu)?;
         let parser = ParserConfig::default().load(cnerf_models::parser())?;
         let near = cnerf_models::start(&self.model);
         let near = near.map(|bytes| NearStart::from_bytes(self.model.as_ref(), bytes)).transpose()?;
@@ -130,9 +130,7 @@ impl Arguments {
                 let helpers = match known {
                     // For the photo beside the portrait, nothing but its crop is needed.
                     true => Helpers::default(),
-                    false => {
-                        Helpers { perceptual: perceptual.as_ref(), parser: parser.as_deref(), near: near.as_ref() }
-                    }
+                    false => Helpers { likeness: Some(&likeness), parser: parser.as_deref(), near: near.as_ref() },
                 };
                 let subject = people.subject(index, side, helpers, &EvaluationOptions::default())?;
                 let photo = subject.aligned.picture.clone();
@@ -140,7 +138,7 @@ impl Arguments {
                     return Ok(Person { name: name.clone(), photo, portrait: Portrait::load(&path)? });
                 }
                 let config = InvertConfig { seed: self.seed, ..self.config.clone() };
-                let mut inverter = Inverter::new(model, &self.model, subject, config, helpers.perceptual)?;
+                let mut inverter = Inverter::new(model, &self.model, subject, config, helpers.likeness)?;
                 while inverter.step()?.is_some() {}
                 let portrait = inverter.finish()?.portrait;
                 eprintln!("{input}: {:.1} dB in {:.0} s", portrait.metrics.psnr, portrait.metrics.seconds);

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use anyhow::bail;
 use clap::Args;
 use cnerf_core::{
-    eval::perceptual::Perceptual,
     interop::chart::{Axis, LineChart, Mark, Series, histogram},
     model::generator::Generator,
 };
 use cnerf_invert::{
     config::{Effort, InvertConfig},
     evaluation::{EvaluationOptions, Helpers, InversionScore, InversionSummary, People, Variant, invert_one},
+    likeness::Likeness,
     parser::ParserConfig,
 };
 use serde::Serialize;
@@ -58,7 +58,7 @@ pub struct InversionArguments {
     /// Begin at the model's mean portrait, not at a guess from photo and regions
     #[arg(long)]
     far_start: bool,
-    /// LPIPS weights (safetensors): the perceptual loss, as in `invert`, and the `lpips` column
+    /// LPIPS weights (safetensors): the perceptual loss in place of the built-in parser's features, and the `lpips` column
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
     #[command(flatten)]
@@ -103,10 +103,10 @@ impl InversionArguments {
         self.plots.check(&CHARTS)?;
         let people = People::open(&self.data, self.count as usize, seed)?;
         let generator = self.model.load_or("portrait")?;
-        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
+        let likeness = Likeness::load(self.lpips.as_deref(), cnerf_models::parser(), &generator.device())?;
         let parser = self.parser.load(cnerf_models::parser())?;
         let near = if self.far_start { None } else { self.model.near_start("portrait")? };
-        let helpers = Helpers { perceptual: perceptual.as_ref(), parser: parser.as_deref(), near: near.as_ref() };
+        let helpers = Helpers { likeness: Some(&likeness), parser: parser.as_deref(), near: near.as_ref() };
         let efforts = if self.efforts.is_empty() { vec![self.config.effort] } else { self.efforts.clone() };
         let rows: Vec<(Effort, Variant)> =
             efforts.iter().flat_map(|effort| self.variant.iter().map(|variant| (*effort, *variant))).collect();
@@ -131,7 +131,7 @@ impl InversionArguments {
                 effort.name(),
                 steps.pivot(),
                 variant.apply(config.clone()).steps().tune,
-                if perceptual.is_some() { "" } else { "; no --lpips: no LPIPS" },
+                if self.lpips.is_some() { "" } else { "; no --lpips: no LPIPS" },
             ));
             let options = EvaluationOptions {
                 config,
@@ -295,11 +295,7 @@ fn table(rows: &[Measured]) -> String {
             shown(found.novel_view_psnr, 2),
         ];
         cells.extend(TURNS_SHOWN_RAD.map(|turn| shown(found.turned(turn).map(|turned| turned.psnr), 2)));
-        cells.extend([
-            shown(found.depth_correlation, 3),
-            shown(found.pose_error_rad, 3),
-            shown(found.depth_drift, 5),
-        ]);
+        cells.extend([shown(found.depth_correlation, 3), shown(found.pose_error_rad, 3), shown(found.depth_drift, 5)]);
         line(row.effort.name(), row.variant.name(), cells)
     }));
     lines.join("\n")
