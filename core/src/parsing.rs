@@ -21,7 +21,11 @@ use crate::{
     camera::Camera,
     data::{labels::LabelMap, picture},
     error::{Error, Result},
-    model::file::{self, Tensors},
+    eval::perceptual::unit_length,
+    model::{
+        file::{self, Tensors},
+        layers::Resampling,
+    },
     parameters::Parameters,
     region::REGION_COUNT,
 };
@@ -114,6 +118,43 @@ impl FaceParser {
     }
 }
 
+impl FaceParser {
+    /// Whether [`Self::features`] can be taken of pictures of `side` x `side` pixels: [`SIDE`] or a power of two times it.
+    pub fn sees(side: usize) -> bool {
+        side >= SIDE && side.is_multiple_of(SIDE) && (side / SIDE).is_power_of_two()
+    }
+
+    /// What the network makes of pictures `[B, 3, R, R]` in [-1, 1] on its way down: maps from 64² to 8². Faces that look
+    /// alike have features that are alike, which serves where no LPIPS weights are at hand. Differentiable.
+    ///
+    /// # Errors
+    /// For a side that [`Self::sees`] refuses.
+    pub fn features(&self, pictures: &Tensor) -> Result<Vec<Tensor>> {
+        if pictures.rank() != 4 || !Self::sees(pictures.dim(3)?) {
+            return Err(Error::shape("pictures", format!("[B, 3, R, R], R = {SIDE} or 2^n times it"), pictures.dims()));
+        }
+        let mut pictures = pictures.clone();
+        while pictures.dim(3)? > SIDE {
+            pictures = Resampling::AverageDown.apply(&pictures)?;
+        }
+        self.network.maps(&network::packed_tensor(&pictures)?)
+    }
+
+    /// Between features from [`Self::features`]: squared differences of unit vectors over channels, averaged over each
+    /// map and summed over maps (LPIPS without learnt heads). `[B]`.
+    ///
+    /// # Errors
+    /// If there are no maps, or they differ in shape.
+    pub fn feature_distance(a: &[Tensor], b: &[Tensor]) -> Result<Tensor> {
+        let terms = a.iter().zip(b).map(|(a, b)| {
+            let difference = (unit_length(a)? - unit_length(b)?)?.sqr()?.sum(1)?.mean((1, 2))?;
+            Ok(difference)
+        });
+        let sum = terms.reduce(|sum: Result<Tensor>, term| Ok((sum? + term?)?));
+        sum.unwrap_or_else(|| Err(Error::shape("features", "one map at least", &[0])))
+    }
+}
+
 /// Writes a network's weights as f16 with a header.
 fn write(path: &Path, parameters: &Parameters, provenance: &str) -> Result<()> {
     let halves = parameters.snapshot()?.into_iter().map(|(name, tensor)| Ok((name, tensor.to_dtype(DType::F16)?)));
@@ -171,6 +212,30 @@ mod tests {
         assert!(differing < 20, "{differing}");
         assert!((face.camera.azimuth_rad + mirrored.camera.azimuth_rad).abs() < 1e-5);
         assert!((face.eyes[0][0] + mirrored.eyes[1][0]).abs() < 1e-5);
+    }
+
+    #[test]
+    fn features_are_of_the_picture_that_is_parsed_and_tell_pictures_apart() {
+        let (_folder, path) = fresh();
+        let parser = FaceParser::from_bytes(&path, &file::read_bytes(&path).unwrap()).unwrap();
+        let portrait = RgbImage::from_fn(128, 128, |x, y| image::Rgb([(2 * x) as u8, y as u8, (x * y / 64) as u8]));
+        let tensor = picture::to_tensor(std::slice::from_ref(&portrait), &Device::Cpu).unwrap();
+        let packed: Vec<f32> = network::packed_tensor(&tensor).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+        assert_eq!(packed, network::packed(&portrait));
+        let features = parser.features(&tensor).unwrap();
+        let sides: Vec<usize> = features.iter().map(|map| map.dim(3).unwrap()).collect();
+        assert_eq!(sides, [64, 32, 16, 8]);
+        let distance = |other: &Tensor| -> f32 {
+            let other = parser.features(other).unwrap();
+            FaceParser::feature_distance(&features, &other).unwrap().to_vec1().unwrap()[0]
+        };
+        assert_eq!(distance(&tensor), 0.0);
+        // Twice as large, each pixel four times: the same picture.
+        let large = imageops::resize(&portrait, 256, 256, imageops::FilterType::Nearest);
+        assert!(distance(&picture::to_tensor(&[large], &Device::Cpu).unwrap()) < 1e-6);
+        let little = distance(&(&tensor * 0.95).unwrap());
+        assert!(little > 0.0 && distance(&tensor.neg().unwrap()) > little);
+        assert!(parser.features(&tensor.narrow(3, 0, 64).unwrap()).is_err());
     }
 
     #[test]

@@ -9,6 +9,7 @@ use cnerf_invert::{
     config::{Effort, InvertConfig},
     events::Event,
     inverter::Inverter,
+    likeness::Likeness,
     photo::{PhotoOptions, Subject},
 };
 use image::{RgbImage, imageops};
@@ -24,12 +25,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         _ => Effort::Balanced,
     };
     let generator = Generator::open(model.as_ref(), &Device::Cpu)?;
-    let perceptual = rest.get(1).map(|file| Perceptual::load(file, &Device::Cpu)).transpose()?;
+    let likeness = rest.get(1).map(|file| Perceptual::load(file, &Device::Cpu)).transpose()?.map(Likeness::Lpips);
     let size = generator.output_resolution() as u32;
     let subject = Subject::read(Path::new(photo), &PhotoOptions::default(), None, size)?;
     let config = InvertConfig { effort, ..InvertConfig::default() };
 
-    let mut inverter = Inverter::new(&generator, model, subject, config, perceptual.as_ref())?;
+    let mut inverter = Inverter::new(&generator, model, subject, config, likeness.as_ref())?;
     while let Some(event) = inverter.step()? {
         match event {
             Event::Pivot(report) | Event::Tune(report) if report.step % 20 == 0 || report.step == report.total => {

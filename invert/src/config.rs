@@ -135,6 +135,8 @@ pub struct PivotConfig {
     pub prior: f64,
     /// Weight of the rows' mean squared distance from their own mean: how strongly regions are held to one person.
     pub agreement: f64,
+    /// Share of the rays that go where the picture was off; the others go anywhere.
+    pub focus: f64,
     /// Standard deviations that hold the camera to its first guess: angles (radians), shift, ln zoom.
     pub camera_prior: [f64; 3],
     /// Weight of that hold.
@@ -153,6 +155,7 @@ impl Default for PivotConfig {
             opacity: 0.1,
             prior: 2e-3,
             agreement: 1e-3,
+            focus: 0.5,
             camera_prior: [0.08, 0.05, 0.05],
             camera: 2e-3,
         }
@@ -175,6 +178,8 @@ pub struct TuneConfig {
     pub locality_every: usize,
     /// Weight of the depth at off-views, held to the pivot's; errors in hundredths of world units.
     pub depth: f64,
+    /// Weight of the masks at off-views, held to the pivot's.
+    pub masks: f64,
     /// How far the off-views are turned, radians.
     pub off_view_rad: f64,
     /// Stop when the loss has not fallen by a share of 1/1000 for this many steps.
@@ -190,6 +195,7 @@ impl Default for TuneConfig {
             locality_distance: 1.0,
             locality_every: 4,
             depth: 1.0,
+            masks: 0.3,
             off_view_rad: 0.4,
             patience: 40,
         }

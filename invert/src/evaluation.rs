@@ -2,48 +2,41 @@
 //! unless asked, measured against what the data set knows of them.
 
 pub mod parsing;
+mod people;
+mod summary;
 
-use std::{
-    path::{Path, PathBuf},
-    time::Instant,
-};
+use std::{path::Path, time::Instant};
 
 use candle_core::{DType, Device, Tensor};
 use cnerf_core::{
     camera::Camera,
-    data::{
-        dataset::{Dataset, Item},
-        labels::LabelMap,
-        picture,
-    },
+    data::{labels::LabelMap, picture},
     eval::{
         consistency::correlation,
-        perceptual::Perceptual,
         quality::{self, Agreement},
         warp::{Raster, Surface},
     },
-    model::{file, generator::Generator},
+    model::generator::Generator,
     region::Region,
-    rng::Stream,
 };
 use image::RgbImage;
 use serde::Serialize;
 
+pub use self::{
+    people::People,
+    summary::{InversionSummary, TurnSummary},
+};
+use self::{people::Person, summary::mean};
 use crate::{
-    align,
     config::InvertConfig,
-    error::{Error, Result},
+    error::Result,
     events::Event,
     inverter::{Inverter, Opened},
+    likeness::Likeness,
     parser::RegionParser,
-    photo::{PhotoOptions, Subject},
+    portrait::Portrait,
     start::NearStart,
 };
-
-/// The first element of every stream drawn here.
-const STREAM: u64 = 0x6576_616c;
-/// Photos in a folder that is no data set are told by these.
-const EXTENSIONS: [&str; 5] = ["png", "jpg", "jpeg", "webp", "bmp"];
 
 /// Which inversion is measured: the rows of an ablation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -52,9 +45,9 @@ const EXTENSIONS: [&str; 5] = ["png", "jpg", "jpeg", "webp", "bmp"];
 pub enum Variant {
     /// Codes and camera alone; the model stays as it is.
     Pivot,
-    /// Pivotal tuning as published: every layer at one rate, nothing holds depth at other views.
+    /// Pivotal tuning as published: every layer at one rate, nothing holds the geometry at other views.
     Plain,
-    /// Tuning with slow geometry and depth held at other views.
+    /// Tuning with slow geometry, depth and masks held at other views.
     #[default]
     Ours,
 }
@@ -66,7 +59,7 @@ impl Variant {
         match self {
             Self::Pivot => config.tune_steps = Some(0),
             Self::Plain => {
-                config.tune.depth = 0.0;
+                (config.tune.depth, config.tune.masks) = (0.0, 0.0);
                 config.tune.geometry_rate = config.tune.texture_rate;
             }
             Self::Ours => {}
@@ -102,177 +95,12 @@ pub struct EvaluationOptions {
 /// What people are inverted with beside the model.
 #[derive(Clone, Copy, Default)]
 pub struct Helpers<'a> {
-    /// Adds a perceptual loss and the LPIPS metric.
-    pub perceptual: Option<&'a Perceptual>,
+    /// Adds a perceptual loss, and the LPIPS metric if it is that.
+    pub likeness: Option<&'a Likeness>,
     /// Finds regions and head pose, unless the inverter is told them.
     pub parser: Option<&'a dyn RegionParser>,
     /// Finds first codes.
     pub near: Option<&'a NearStart>,
-}
-
-/// Who is inverted: the people of a data set, each with all views there are, or the photos of a folder.
-pub struct People {
-    source: Source,
-}
-
-enum Source {
-    /// Items of each person; the first is inverted.
-    Dataset {
-        dataset: Box<Dataset>,
-        people: Vec<Vec<usize>>,
-    },
-    Photos(Vec<PathBuf>),
-}
-
-/// Another view of a person.
-struct OtherView {
-    camera: Camera,
-    image: RgbImage,
-    labels: Option<LabelMap>,
-}
-
-/// One person: what is inverted, and what is known.
-struct Person {
-    name: String,
-    subject: Subject,
-    camera: Option<Camera>,
-    labels: Option<LabelMap>,
-    /// Depth along the view axis, world units.
-    depth: Option<Raster>,
-    others: Vec<OtherView>,
-}
-
-impl People {
-    /// The data set at `path`, else the photos in it; at most `count` people, drawn from `seed`.
-    ///
-    /// Items of a data set that share a field `head` (`cnerf synth --views`) are views of one person.
-    ///
-    /// # Errors
-    /// If `path` is neither, or holds nobody.
-    pub fn open(path: &Path, count: usize, seed: u64) -> Result<Self> {
-        let mut random = Stream::new(seed, &[STREAM]);
-        if path.is_dir() && !path.join("dataset.json").is_file() {
-            let mut photos = list_photos(path)?;
-            let order = random.permutation(photos.len());
-            photos = order.into_iter().take(count).filter_map(|index| photos.get(index).cloned()).collect();
-            if photos.is_empty() {
-                let reason = "holds neither dataset.json nor photos (png, jpg, webp, bmp)";
-                return Err(Error::malformed(path, reason));
-            }
-            return Ok(Self { source: Source::Photos(photos) });
-        }
-        let dataset = Dataset::open(path)?;
-        let people = dataset.people();
-        if people.is_empty() {
-            return Err(Error::malformed(path, "holds no portraits"));
-        }
-        let order = random.permutation(people.len());
-        let people = order.into_iter().take(count).filter_map(|index| people.get(index).cloned()).collect();
-        Ok(Self { source: Source::Dataset { dataset: Box::new(dataset), people } })
-    }
-
-    /// Number of people.
-    pub fn len(&self) -> usize {
-        match &self.source {
-            Source::Dataset { people, .. } => people.len(),
-            Source::Photos(photos) => photos.len(),
-        }
-    }
-
-    /// Whether there is nobody.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// The name of a person's photo.
-    pub fn name(&self, index: usize) -> String {
-        match &self.source {
-            Source::Photos(photos) => photos.get(index).map(|path| path.display().to_string()),
-            Source::Dataset { dataset, people } => people
-                .get(index)
-                .and_then(|items| dataset.entries().get(*items.first()?))
-                .map(|entry| entry.image.clone()),
-        }
-        .unwrap_or_default()
-    }
-
-    /// Reads one person at `side` x `side` pixels.
-    fn read(
-        &self,
-        index: usize,
-        side: u32,
-        Helpers { parser, near, .. }: Helpers<'_>,
-        options: &EvaluationOptions,
-    ) -> Result<Person> {
-        let name = self.name(index);
-        let (dataset, items) = match &self.source {
-            Source::Photos(photos) => {
-                let path = photos.get(index).ok_or_else(|| Error::config("--count", "beyond the photos there are"))?;
-                let mut subject = Subject::read(path, &PhotoOptions::default(), parser, side)?;
-                near.map_or(Ok(()), |near| subject.start_near(near))?;
-                return Ok(Person { name, subject, camera: None, labels: None, depth: None, others: Vec::new() });
-            }
-            Source::Dataset { dataset, people } => {
-                (dataset, people.get(index).ok_or_else(|| Error::config("--count", "beyond the people there are"))?)
-            }
-        };
-        let (first, rest) = items.split_first().ok_or_else(|| Error::config("--data", "a person without photos"))?;
-        let Item { image, mask, camera } = dataset.item(*first)?;
-        let labels = mask.map(|mask| mask.resized(side, side)).transpose()?;
-        let mut aligned = align::already_aligned(&image, side)?;
-        let parsed = parser.map(|parser| aligned.parse(&image, parser)).transpose()?;
-        if options.known_pose {
-            aligned.camera = camera
-                .ok_or_else(|| Error::config("--known-pose", format!("{name}: the data set names no camera for it")))?;
-        }
-        let regions = if options.known_masks { labels.clone() } else { parsed };
-        if options.known_masks && regions.is_none() {
-            return Err(Error::config("--known-masks", format!("{name}: the data set has no mask of it")));
-        }
-        let mut subject = Subject {
-            source: name.clone(),
-            aligned,
-            labels: regions,
-            start: None,
-            parser_seconds: None,
-            warnings: Vec::new(),
-        };
-        near.map_or(Ok(()), |near| subject.start_near(near))?;
-        let other = |index: &usize| -> Result<Option<OtherView>> {
-            let Item { image, mask, camera } = dataset.item(*index)?;
-            let Some(camera) = camera else { return Ok(None) };
-            let labels = mask.map(|mask| mask.resized(side, side)).transpose()?;
-            Ok(Some(OtherView { camera, image: picture::resize(&image, side, side)?, labels }))
-        };
-        let others = rest.iter().filter_map(|index| other(index).transpose()).collect::<Result<_>>()?;
-        Ok(Person { name, subject, camera, labels, depth: known_depth(dataset, *first)?, others })
-    }
-}
-
-fn list_photos(folder: &Path) -> Result<Vec<PathBuf>> {
-    let failed = |error| cnerf_core::Error::io(folder, error);
-    let mut photos = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        let extension = path.extension().map(|extension| extension.to_string_lossy().to_ascii_lowercase());
-        if path.is_file() && extension.is_some_and(|extension| EXTENSIONS.contains(&extension.as_str())) {
-            photos.push(path);
-        }
-    }
-    photos.sort();
-    Ok(photos)
-}
-
-/// The depth that `cnerf synth --with depth` left beside an item.
-fn known_depth(dataset: &Dataset, index: usize) -> Result<Option<Raster>> {
-    let Some(name) = dataset.entry(index)?.extra.get("depth").and_then(|name| name.as_str()) else {
-        return Ok(None);
-    };
-    let path = dataset.path().join(name);
-    let (tensors, _) = file::parse_safetensors(&path, &dataset.file(name)?)?;
-    let depth = tensors.get("depth").filter(|depth| depth.rank() == 2);
-    let depth = depth.ok_or_else(|| Error::malformed(&path, "holds no tensor `depth` [S, S]"))?;
-    Ok(Some(Raster::from_tensor(&depth.unsqueeze(0)?.unsqueeze(0)?)?))
 }
 
 /// What one inversion gave.
@@ -320,8 +148,8 @@ pub struct NovelView {
     pub foreground_psnr: Option<f64>,
 }
 
-/// Inverts one of `people` with the help of `helpers` and measures the result. `step` is called after every optimiser step with those done and
-/// those there are in all.
+/// Inverts one of `people` with the help of `helpers` and measures the result; the portrait comes with it. `step` is
+/// called after every optimiser step with those done and those there are in all.
 ///
 /// Other views are rendered from the found camera turned by as much as the true cameras are apart: an error of the
 /// pose is counted as such and not again at every view.
@@ -332,7 +160,7 @@ pub fn invert_one(
     helpers: Helpers<'_>,
     options: &EvaluationOptions,
     step: &mut dyn FnMut(usize, usize),
-) -> Result<InversionScore> {
+) -> Result<(InversionScore, Portrait)> {
     let began = Instant::now();
     let side = generator.output_resolution() as u32;
     let person = people.read(index, side, helpers, options)?;
@@ -343,8 +171,7 @@ pub fn invert_one(
     let steps = config.steps();
     // What was read of other views is no part of inverting a photo, but as nothing beside the optimisation.
     let started = Instant::now();
-    let mut inverter =
-        Inverter::new(generator, &options.model_name, person.subject.clone(), config, helpers.perceptual)?;
+    let mut inverter = Inverter::new(generator, &options.model_name, person.subject.clone(), config, helpers.likeness)?;
     let (mut done, mut curve) = (0, Vec::new());
     while let Some(event) = inverter.step()? {
         if let Event::Pivot(report) | Event::Tune(report) = event {
@@ -356,7 +183,7 @@ pub fn invert_one(
     let portrait = inverter.finish()?.portrait;
     let seconds = read_seconds + started.elapsed().as_secs_f64();
     let opened = Opened::new(&portrait, Path::new(&person.name), generator)?;
-    let metrics = portrait.metrics;
+    let metrics = &portrait.metrics;
     let mut score = InversionScore {
         input: person.name.clone(),
         seconds,
@@ -368,7 +195,7 @@ pub fn invert_one(
         ..InversionScore::default()
     };
     measure(&person, &photo, &opened, &mut score)?;
-    Ok(score)
+    Ok((score, portrait))
 }
 
 fn measure(person: &Person, photo: &RgbImage, opened: &Opened, score: &mut InversionScore) -> Result<()> {
@@ -442,66 +269,14 @@ fn angle_between(a: &Camera, b: &Camera) -> f64 {
     cosine.clamp(-1.0, 1.0).acos()
 }
 
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (sum, count) = values.fold((0.0, 0usize), |(sum, count), value| (sum + value, count + 1));
-    (count > 0).then(|| sum / count as f64)
-}
-
-/// The means of several inversions.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct InversionSummary {
-    /// Photos inverted.
-    pub count: usize,
-    /// Photos that could not be.
-    pub failed: usize,
-    /// See [`InversionScore`], and so below.
-    pub seconds: f64,
-    /// dB.
-    pub psnr: f64,
-    /// 0 to 1.
-    pub ms_ssim: f64,
-    /// If weights were given.
-    pub lpips: Option<f64>,
-    /// If the data has masks.
-    pub mask_miou: Option<f64>,
-    /// dB, if the data has other views.
-    pub novel_view_psnr: Option<f64>,
-    /// dB, without the background.
-    pub novel_view_foreground_psnr: Option<f64>,
-    /// If the data has depth.
-    pub depth_correlation: Option<f64>,
-    /// Radians, if the data has cameras.
-    pub pose_error_rad: Option<f64>,
-    /// World units.
-    pub depth_drift: f64,
-}
-
-impl InversionSummary {
-    /// The means of `scores`; what a photo lacks is left out of the mean.
-    pub fn of(scores: &[InversionScore], failed: usize) -> Self {
-        let of = |value: fn(&InversionScore) -> Option<f64>| mean(scores.iter().filter_map(value));
-        Self {
-            count: scores.len(),
-            failed,
-            seconds: of(|score| Some(score.seconds)).unwrap_or_default(),
-            psnr: of(|score| Some(score.psnr)).unwrap_or_default(),
-            ms_ssim: of(|score| Some(score.ms_ssim)).unwrap_or_default(),
-            lpips: of(|score| score.lpips),
-            mask_miou: of(|score| score.mask_miou),
-            novel_view_psnr: of(|score| score.novel_view_psnr),
-            novel_view_foreground_psnr: of(|score| score.novel_view_foreground_psnr),
-            depth_correlation: of(|score| score.depth_correlation),
-            pose_error_rad: of(|score| score.pose_error_rad),
-            depth_drift: of(|score| Some(score.depth_drift)).unwrap_or_default(),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use cnerf_core::data::{
-        cartoon::{RenderOptions, SynthOptions, synth},
-        dataset::{DatasetWriter, EncodedItem, PhotoFormat},
+    use cnerf_core::{
+        data::{
+            cartoon::{RenderOptions, SynthOptions, synth},
+            dataset::{DatasetWriter, EncodedItem, PhotoFormat},
+        },
+        model::file,
     };
 
     use super::*;
@@ -539,7 +314,8 @@ mod tests {
         let mut steps = Vec::new();
         let score =
             invert_one(&generator, &people, 0, Helpers::default(), &options, &mut |done, all| steps.push((done, all)));
-        let score = score.unwrap();
+        let (score, portrait) = score.unwrap();
+        assert_eq!((portrait.source.as_str(), portrait.metrics.psnr), (score.input.as_str(), score.psnr));
         assert_eq!(steps, [(1, 4), (2, 4), (3, 4), (4, 4)]);
         assert_eq!((score.novel_views.len(), score.curve.len()), (2, 4));
         // A known pose is kept, to f32.
@@ -548,7 +324,8 @@ mod tests {
         assert!(score.depth_correlation.is_some_and(|found| (-1.0..=1.0).contains(&found)), "{score:?}");
         let pivot = EvaluationOptions { variant: Variant::Pivot, ..options };
         let mut count = 0;
-        let again = invert_one(&generator, &people, 0, Helpers::default(), &pivot, &mut |_, _| count += 1).unwrap();
+        let (again, _) =
+            invert_one(&generator, &people, 0, Helpers::default(), &pivot, &mut |_, _| count += 1).unwrap();
         assert_eq!((count, again.depth_drift), (3, 0.0));
 
         let summary = InversionSummary::of(&[score.clone(), again.clone()], 1);
@@ -562,7 +339,7 @@ mod tests {
         assert_eq!(Variant::Ours.apply(config.clone()), config);
         assert_eq!(Variant::Pivot.apply(config.clone()).steps().tune, 0);
         let plain = Variant::Plain.apply(config);
-        assert_eq!((plain.tune.depth, plain.tune.geometry_rate), (0.0, plain.tune.texture_rate));
+        assert_eq!((plain.tune.depth, plain.tune.masks, plain.tune.geometry_rate), (0.0, 0.0, plain.tune.texture_rate));
     }
 
     #[test]

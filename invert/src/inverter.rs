@@ -10,10 +10,7 @@ use candle_core::{DType, Device, Tensor};
 use cnerf_core::{
     camera::Camera,
     data::{labels::LabelMap, picture},
-    eval::{
-        perceptual::Perceptual,
-        quality::{self, Agreement},
-    },
+    eval::quality::{self, Agreement},
     model::{
         file::{self, Tensors},
         generator::{Generator, Picture},
@@ -30,6 +27,7 @@ use crate::{
     config::{Effort, InvertConfig},
     error::{Error, Result},
     events::Event,
+    likeness::Likeness,
     objective::Target,
     photo::Subject,
     pivot::{Pivot, whole_picture},
@@ -50,7 +48,7 @@ const COLOUR_BIAS: &str = "field.colour.bias";
 /// An inversion under way.
 pub struct Inverter<'a> {
     generator: &'a Generator,
-    perceptual: Option<&'a Perceptual>,
+    likeness: Option<&'a Likeness>,
     config: InvertConfig,
     model: ModelName,
     subjects: Vec<Subject>,
@@ -87,16 +85,16 @@ pub struct Panels {
 }
 
 impl<'a> Inverter<'a> {
-    /// Prepares the inversion of `subject`. `model_name` is what the user calls the model. `perceptual` adds a
-    /// perceptual loss and the LPIPS metric.
+    /// Prepares the inversion of `subject`. `model_name` is what the user calls the model. `likeness` adds a
+    /// perceptual loss, and the LPIPS metric if it is that.
     pub fn new(
         generator: &'a Generator,
         model_name: &str,
         subject: Subject,
         config: InvertConfig,
-        perceptual: Option<&'a Perceptual>,
+        likeness: Option<&'a Likeness>,
     ) -> Result<Self> {
-        Self::of_person(generator, model_name, vec![subject], config, perceptual)
+        Self::of_person(generator, model_name, vec![subject], config, likeness)
     }
 
     /// Prepares the inversion of several photos of one person: they will share codes and weights, each has its own
@@ -106,7 +104,7 @@ impl<'a> Inverter<'a> {
         model_name: &str,
         subjects: Vec<Subject>,
         config: InvertConfig,
-        perceptual: Option<&'a Perceptual>,
+        likeness: Option<&'a Likeness>,
     ) -> Result<Self> {
         let started = Instant::now();
         config.validate()?;
@@ -114,7 +112,7 @@ impl<'a> Inverter<'a> {
             return Err(Error::config("photos", "at least one is needed"));
         }
         let target =
-            |subject: &Subject| Target::new(&subject.aligned.picture, subject.labels.as_ref(), generator, perceptual);
+            |subject: &Subject| Target::new(&subject.aligned.picture, subject.labels.as_ref(), generator, likeness);
         let targets = subjects.iter().map(target).collect::<Result<_>>()?;
         let cameras: Vec<Camera> = subjects.iter().map(|subject| subject.aligned.camera).collect();
         let starts: Vec<&Tensor> = subjects.iter().filter_map(|subject| subject.start.as_ref()).collect();
@@ -125,7 +123,7 @@ impl<'a> Inverter<'a> {
         let model = ModelName { name: model_name.to_owned(), hash: generator.hash()? };
         let seconds = started.elapsed().as_secs_f64();
         let (tune, settled) = (None, false);
-        Ok(Self { generator, perceptual, config, model, subjects, targets, pivot, tune, settled, pending, seconds })
+        Ok(Self { generator, likeness, config, model, subjects, targets, pivot, tune, settled, pending, seconds })
     }
 
     /// Writes all that the steps so far have changed to `path`, under a temporary name first.
@@ -178,7 +176,8 @@ impl<'a> Inverter<'a> {
     /// What the outcome is a function of, as one hash.
     fn fingerprint(&self) -> Result<String> {
         let config = serde_json::to_vec(&self.config).map_err(|error| Error::config("settings", error))?;
-        let named = format!("{} {}", self.model.hash, self.perceptual.is_some());
+        let likeness = self.likeness.map_or("none", Likeness::name);
+        let named = format!("{} {likeness}", self.model.hash);
         let bytes = |bytes: &[u8]| Tensor::from_slice(bytes, bytes.len(), &Device::Cpu);
         let mut all =
             Tensors::from([("config".to_owned(), bytes(&config)?), ("model".to_owned(), bytes(named.as_bytes())?)]);
@@ -312,10 +311,7 @@ impl<'a> Inverter<'a> {
     fn measure(&self, picture: &Picture, target: &Target) -> Result<Metrics> {
         let photo = &target.output.colour;
         let rgb = picture.rgb.clamp(-1.0, 1.0)?;
-        let lpips = match self.perceptual {
-            Some(perceptual) => perceptual.distance(&rgb, photo)?.to_vec1::<f32>()?.first().copied().map(f64::from),
-            None => None,
-        };
+        let lpips = self.likeness.map_or(Ok(None), |likeness| likeness.lpips(&rgb, photo))?;
         let mask_miou = match &target.output.masks {
             Some(known) => {
                 let mut agreement = Agreement::default();
@@ -407,7 +403,7 @@ impl Opened {
 
 /// About how many seconds a photo will take with this configuration, on this machine: one step of each kind, timed on
 /// a grey picture. At fast effort a step on the whole picture would be a tenth of the work: it is guessed from the rays.
-pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, perceptual: Option<&Perceptual>) -> Result<f64> {
+pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, likeness: Option<&Likeness>) -> Result<f64> {
     /// A step of tuning against a step of the pivot on whole pictures: depth and locality come on top.
     const TUNE_SHARE: f64 = 1.3;
     /// A ray of a whole picture against one alone: features, normals and the upsampler come on top.
@@ -415,7 +411,7 @@ pub fn estimate_seconds(generator: &Generator, config: &InvertConfig, perceptual
     let began = Instant::now();
     let side = generator.output_resolution() as u32;
     let grey = RgbImage::from_pixel(side, side, image::Rgb([128; 3]));
-    let target = Target::new(&grey, None, generator, perceptual)?;
+    let target = Target::new(&grey, None, generator, likeness)?;
     let steps = config.steps();
     // A pivot of two steps takes them on rays, with as many rays as the effort has.
     let short = InvertConfig { pivot_steps: Some(2), ..config.clone() };

@@ -9,9 +9,11 @@ pub mod edit;
 pub mod error;
 pub mod evaluation;
 pub mod events;
+mod focus;
 #[cfg(test)]
 mod fuzz;
 pub mod inverter;
+pub mod likeness;
 pub mod objective;
 pub mod parser;
 pub mod photo;

@@ -4,7 +4,6 @@ use candle_core::{DType, Device, Tensor};
 use cnerf_core::{
     camera,
     data::{labels::LabelMap, picture},
-    eval::perceptual::Perceptual,
     model::{field::PortraitField, generator::Generator},
     region::{REGION_COUNT, Region, RegionSet},
     render::{Outputs, RayBundle, RayOutput, Sampling, render_rays},
@@ -12,7 +11,7 @@ use cnerf_core::{
 };
 use image::RgbImage;
 
-use crate::error::Result;
+use crate::{error::Result, likeness::Likeness};
 
 /// How much more a pixel of eyes, brows, mouth, nose or ears counts (recipe).
 const DETAIL_BOOST: f32 = 2.0;
@@ -28,7 +27,7 @@ pub struct Target {
     /// `[1, 3, R, R]` in [-1, 1].
     pub output: Level,
     /// Perceptual features of the output, taken once.
-    features: Option<(Perceptual, Vec<Tensor>)>,
+    features: Option<(Likeness, Vec<Tensor>)>,
 }
 
 /// The photo at one resolution.
@@ -76,21 +75,21 @@ impl Target {
         portrait: &RgbImage,
         labels: Option<&LabelMap>,
         generator: &Generator,
-        perceptual: Option<&Perceptual>,
+        likeness: Option<&Likeness>,
     ) -> Result<Self> {
         let device = generator.device();
         let output = Level::new(portrait, labels, generator.output_resolution(), &device)?;
-        let features = perceptual
-            .filter(|perceptual| output.resolution >= perceptual.backbone().smallest_side())
-            .map(|perceptual| Ok::<_, cnerf_core::Error>((perceptual.clone(), perceptual.features(&output.colour)?)))
+        let features = likeness
+            .filter(|likeness| likeness.sees(output.resolution))
+            .map(|likeness| Ok::<_, crate::Error>((likeness.clone(), likeness.features(&output.colour)?)))
             .transpose()?;
         Ok(Self { render: Level::new(portrait, labels, generator.render_resolution(), &device)?, output, features })
     }
 
-    /// Perceptual distance of a picture `[1, 3, R, R]` to the photo, a scalar; none without weights.
+    /// Perceptual distance of a picture `[1, 3, R, R]` to the photo, a scalar, in LPIPS's size; none without features.
     pub fn perceptual(&self, rgb: &Tensor) -> Result<Option<Tensor>> {
-        let Some((perceptual, features)) = &self.features else { return Ok(None) };
-        Ok(Some(perceptual.feature_distance(&perceptual.features(rgb)?, features)?.mean_all()?))
+        let Some((likeness, features)) = &self.features else { return Ok(None) };
+        Ok(Some(likeness.distance(&likeness.features(rgb)?, features)?))
     }
 }
 
@@ -113,6 +112,8 @@ pub struct PhotoWeights {
 pub struct Loss {
     /// A scalar.
     pub total: Tensor,
+    /// Colour errors of what was compared.
+    pub error: Tensor,
     /// Mean squared error, colours in [-1, 1].
     pub squared_error: f64,
 }
@@ -155,7 +156,7 @@ pub fn picture_loss(rgb: &Tensor, target: &Target, weights: &PhotoWeights) -> Re
     {
         total = (total + (distance * weights.perceptual)?)?;
     }
-    Ok(Loss { total, squared_error: scalar(&squared.mean_all()?)? })
+    Ok(Loss { total, squared_error: scalar(&squared.mean_all()?)?, error: error.detach() })
 }
 
 fn weighted(
@@ -177,7 +178,7 @@ fn weighted(
         let person = known.narrow(1, 0, 1)?.affine(-1.0, 1.0)?;
         total = ((total + (off * weights.masks)?)? + (cross_entropy(opacity, &person)? * weights.opacity)?)?;
     }
-    Ok(Loss { total, squared_error: scalar(&squared.mean_all()?)? })
+    Ok(Loss { total, squared_error: scalar(&squared.mean_all()?)?, error: error.detach() })
 }
 
 /// |x| with a gradient that is 0 at 0: √(x² + ε²) - ε, ε a five-hundredth of the colours' range.

@@ -2,8 +2,9 @@
 //!
 //! Coarse to fine: first coordinates that move all rows together, on rays of the field alone, then every row free, then
 //! whole pictures at the output resolution. Codes live in whitened spaces ([`CodeSpace`]), held to the model's
-//! distribution by their mean square and to one person by their distance from where all rows move together. Several photos of one person share the codes;
-//! each has its own camera, and steps take them in turn.
+//! distribution by their mean square and to one person by their distance from where all rows move together. Several
+//! photos of one person share the codes; each has its own camera, and steps take them in turn. Half of the rays go where
+//! the picture was off ([`Focus`]).
 
 use candle_core::{Tensor, Var};
 use cnerf_core::{
@@ -24,6 +25,7 @@ use crate::{
     config::{InvertConfig, PivotConfig, Steps},
     error::Result,
     events::StepReport,
+    focus::Focus,
     objective::{self, Loss, PhotoWeights, Target},
     space::CodeSpace,
 };
@@ -53,6 +55,8 @@ pub struct Pivot {
     /// One a photo, `[1, 6]` each, see [`Camera::parameters`].
     cameras: Vec<Var>,
     first_cameras: Vec<Tensor>,
+    /// Where each photo's picture is off.
+    focus: Vec<Focus>,
     moves_camera: bool,
     optimiser: Adam,
     step: usize,
@@ -90,6 +94,7 @@ impl Pivot {
             rows: zeros(2 * REGION_COUNT)?,
             global: if global { Some(zeros(1)?) } else { None },
             cameras: first_cameras.iter().map(Var::from_tensor).collect::<candle_core::Result<_>>()?,
+            focus: first_cameras.iter().map(|_| Focus::new(generator.render_resolution())).collect(),
             first_cameras,
             moves_camera: !config.fixed_camera,
             optimiser: Adam::new(Vec::new(), BETAS),
@@ -120,6 +125,9 @@ impl Pivot {
     pub(crate) fn save(&self, tensors: &mut Tensors) -> Result<()> {
         let values = self.variables().into_iter().map(|(name, value)| (name, value.as_tensor().clone()));
         checkpoint::put_all(tensors, "pivot", values);
+        for (index, focus) in self.focus.iter().enumerate() {
+            tensors.insert(format!("pivot.focus{index}"), focus.state()?);
+        }
         Ok(self.optimiser.save("pivot.adam", tensors)?)
     }
 
@@ -127,6 +135,10 @@ impl Pivot {
     pub(crate) fn restore(&mut self, step: usize, tensors: &Tensors) -> Result<()> {
         for (name, variable) in self.variables() {
             variable.set(&checkpoint::take(tensors, &format!("pivot.{name}"), variable.dims())?)?;
+        }
+        for (index, focus) in self.focus.iter_mut().enumerate() {
+            let shape = focus.state()?.dims().to_vec();
+            focus.restore(&checkpoint::take(tensors, &format!("pivot.focus{index}"), &shape)?)?;
         }
         self.step = step.min(self.steps.pivot());
         // The rows are freed by the step after the shared phase's last.
@@ -175,11 +187,11 @@ impl Pivot {
             self.optimiser = self.optimiser_of(self.rows.clone());
         }
         let whole = self.step >= self.steps.shared + self.steps.free;
-        let (target, camera) = self.turn(targets)?;
+        let (index, target, camera) = self.turn(targets)?;
         let loss = if whole {
             self.whole_loss(generator, target, &camera)?
         } else {
-            self.ray_loss(generator, target, &camera)?
+            self.ray_loss(generator, index, target, &camera)?
         };
         let total = (loss.total.clone() + self.regularisation()?)?;
         let value = objective::scalar(&total)?;
@@ -192,11 +204,11 @@ impl Pivot {
         Ok(StepReport { step: self.step, total: self.steps.pivot(), loss: value, psnr: loss.psnr() })
     }
 
-    /// The photo whose turn it is, and its camera.
-    fn turn<'a>(&self, targets: &'a [Target]) -> Result<(&'a Target, Tensor)> {
+    /// The photo whose turn it is: its number, and its camera.
+    fn turn<'a>(&self, targets: &'a [Target]) -> Result<(usize, &'a Target, Tensor)> {
         let index = self.step % self.cameras.len().max(1);
         match (targets.get(index), self.cameras.get(index)) {
-            (Some(target), Some(camera)) => Ok((target, camera.as_tensor().clone())),
+            (Some(target), Some(camera)) => Ok((index, target, camera.as_tensor().clone())),
             _ => Err(cnerf_core::Error::shape("photos", [self.cameras.len()], &[targets.len()]).into()),
         }
     }
@@ -221,14 +233,21 @@ impl Pivot {
         self.global.as_ref().map(|code| self.space.to_global(code.as_tensor())).transpose()
     }
 
-    fn ray_loss(&self, generator: &Generator, target: &Target, camera: &Tensor) -> Result<Loss> {
+    fn ray_loss(&mut self, generator: &Generator, index: usize, target: &Target, camera: &Tensor) -> Result<Loss> {
         let mut random = Stream::new(self.seed, &[STREAM, self.step as u64]);
         let level = &target.render;
-        let pixels = objective::draw_pixels(level.resolution, self.steps.rays, &mut random, &generator.device())?;
+        let Some(focus) = self.focus.get(index) else {
+            return Err(cnerf_core::Error::shape("photos", [self.focus.len()], &[index + 1]).into());
+        };
+        let pixels = focus.draw(self.steps.rays, self.config.focus, &mut random, &generator.device())?;
         let field = generator.field().portraits(&self.live_codes()?)?;
         let sampling = generator.render_settings().sampling;
         let output = objective::render_pixels(&field, camera, &pixels, level.resolution, &sampling, &mut random)?;
-        objective::ray_loss(&output, level, &pixels, &self.weights())
+        let loss = objective::ray_loss(&output, level, &pixels, &self.weights())?;
+        if let Some(focus) = self.focus.get_mut(index) {
+            focus.saw(&pixels, &loss.error)?;
+        }
+        Ok(loss)
     }
 
     /// The loss of the whole picture seen by `camera`.
@@ -297,5 +316,5 @@ pub fn whole_picture(
 pub fn whole_loss(picture: &Picture, target: &Target, weights: &PhotoWeights) -> Result<Loss> {
     let finished = objective::picture_loss(&picture.rgb, target, weights)?;
     let render = objective::frame_loss(&picture.frame, &target.render, weights)?;
-    Ok(Loss { total: (finished.total + (render.total * RENDER_SHARE)?)?, squared_error: finished.squared_error })
+    Ok(Loss { total: (finished.total.clone() + (render.total * RENDER_SHARE)?)?, ..finished })
 }

@@ -1,7 +1,7 @@
 //! Pivotal tuning (Roich et al., 2021) with the geometry held: the generator's weights move until the frozen pivot
 //! shows the photo, while
 //! - pictures at nearby codes stay those of the original generator (locality), so that edits still work, and
-//! - depth at views the photo does not show stays the pivot's, so that the face is not flattened onto the photo.
+//! - depth and masks at views the photo does not show stay the pivot's, so that the face is not flattened onto the photo.
 //!
 //! Texture layers, colour and feature heads and the upsampler move freely, shape layers slowly. The affine maps from
 //! codes to FiLM keep their weights: around one frozen code only their biases matter, at a hundredth of the numbers.
@@ -91,11 +91,13 @@ impl Progress {
     }
 }
 
-/// A view the photo does not show, and the pivot's depth there.
+/// A view the photo does not show, and the pivot there.
 struct OffView {
     camera: Tensor,
     /// `[1, 1, r, r]`, world units.
     depth: Tensor,
+    /// `[1, 9, r, r]`.
+    masks: Tensor,
 }
 
 impl Tune {
@@ -111,7 +113,8 @@ impl Tune {
             .flat_map(|camera| off_views(camera, config.tune.off_view_rad))
             .map(|view| {
                 let camera = Camera::parameter_tensor(&[view], &generator.device())?;
-                Ok(OffView { depth: depth(original, &frozen.codes, &camera)?, camera })
+                let (depth, masks) = depth_and_masks(original, &frozen.codes, &camera)?;
+                Ok(OffView { camera, depth, masks })
             })
             .collect::<Result<_>>()?;
         let PivotConfig { absolute, squared, perceptual, masks, opacity, .. } = config.pivot;
@@ -183,7 +186,7 @@ impl Tune {
         let photo = self.photo_loss(self.step, targets, true)?;
         let psnr = photo.psnr();
         let photo_loss = objective::scalar(&photo.total)?;
-        let mut total = (photo.total + (self.depth_loss(&mut random)? * self.config.depth)?)?;
+        let mut total = (photo.total + self.off_view_loss(&mut random)?)?;
         if self.config.locality > 0.0 && self.step.is_multiple_of(self.config.locality_every.max(1)) {
             total = (total + (self.locality_loss(original, space, &mut random)? * self.config.locality)?)?;
         }
@@ -239,19 +242,23 @@ impl Tune {
         Ok(())
     }
 
-    /// Mean squared depth error on random rays of one off-view, in [`DEPTH_UNIT`]s.
-    fn depth_loss(&self, random: &mut Stream) -> Result<Tensor> {
-        let Some(view) = random.pick(&self.off_views) else {
-            return Ok(Tensor::zeros((), candle_core::DType::F32, &self.generator.device())?);
-        };
+    /// How far depth and masks are from the pivot's on random rays of one off-view, weighted.
+    fn off_view_loss(&self, random: &mut Stream) -> Result<Tensor> {
+        let device = self.generator.device();
+        let TuneConfig { depth, masks, .. } = self.config;
+        let view = random.pick(&self.off_views).filter(|_| depth > 0.0 || masks > 0.0);
+        let Some(view) = view else { return Ok(Tensor::zeros((), candle_core::DType::F32, &device)?) };
         let settings = self.generator.render_settings();
-        let pixels = objective::draw_pixels(settings.resolution, SIDE_RAYS, random, &self.generator.device())?;
+        let pixels = objective::draw_pixels(settings.resolution, SIDE_RAYS, random, &device)?;
         let field = self.generator.field().portraits(&self.frozen.codes)?;
         // Regular samples, as the pivot's depth was rendered with: only the weights' change may count.
         let output =
             objective::render_regular_pixels(&field, &view.camera, &pixels, settings.resolution, &settings.sampling)?;
         let wanted = view.depth.flatten_from(1)?.index_select(&pixels, 1)?;
-        Ok(((output.depth - wanted)? / DEPTH_UNIT)?.sqr()?.mean_all()?)
+        let off = ((output.depth - wanted)? / DEPTH_UNIT)?.sqr()?.mean_all()?;
+        let wanted = view.masks.flatten_from(2)?.index_select(&pixels, 2)?;
+        let moved = (output.masks - wanted)?.sqr()?.sum(1)?.mean_all()?;
+        Ok(((off * depth)? + (moved * masks)?)?)
     }
 
     /// Mean squared change of colours and masks on random rays of a portrait near the pivot.
@@ -279,7 +286,7 @@ impl Tune {
     pub fn depth_drift(&self, generator: &Generator) -> Result<f64> {
         let mut sum = 0.0;
         for view in &self.off_views {
-            let found = depth(generator, &self.frozen.codes, &view.camera)?;
+            let (found, _) = depth_and_masks(generator, &self.frozen.codes, &view.camera)?;
             sum += objective::scalar(&(found - &view.depth)?.abs()?.mean_all()?)?;
         }
         Ok(sum / self.off_views.len().max(1) as f64)
@@ -291,10 +298,12 @@ fn off_views(camera: &Camera, turn_rad: f64) -> [Camera; 2] {
     [-turn_rad, turn_rad].map(|turn| Camera { azimuth_rad: camera.azimuth_rad + turn, ..*camera })
 }
 
-fn depth(generator: &Generator, codes: &Tensor, camera: &Tensor) -> Result<Tensor> {
-    // Exact, as the samples of `Tune::depth_loss` are: drift must not count what a plan leaves out.
+/// Depth `[1, 1, r, r]`, world units, and masks `[1, 9, r, r]`.
+fn depth_and_masks(generator: &Generator, codes: &Tensor, camera: &Tensor) -> Result<(Tensor, Tensor)> {
+    // Exact, as the samples of `Tune::off_view_loss` are: drift must not count what a plan leaves out.
     let settings = RenderSettings { features: false, normals: false, budget: 0.0, ..generator.render_settings() };
-    Ok(generator.render(codes, camera, &settings)?.depth.detach())
+    let frame = generator.render(codes, camera, &settings)?;
+    Ok((frame.depth.detach(), frame.masks.detach()))
 }
 
 type Variables = Vec<(String, Var)>;

@@ -140,6 +140,42 @@ fn inversion_measures_views_it_was_not_shown() {
 }
 
 #[test]
+fn efforts_are_compared_and_their_portraits_kept() {
+    let folder = Folder::with_model("efforts");
+    folder.run("synth --count 2 --size 64 --seed 5 --with depth --turns -0.4,-0.2,0.2,0.4 --out views").done();
+    let few = "--pivot-steps 8 --tune-steps 1 --efforts fast,balanced --variant ours,pivot";
+    let line = format!("eval inversion --model {MODEL} --data views {few} --plots charts --portraits made");
+    let report = folder.json(&line);
+    let rows = report["variants"].as_array().unwrap();
+    let named = |row: &Value| format!("{} {}", row["effort"], row["variant"]).replace('"', "");
+    assert_eq!(
+        rows.iter().map(named).collect::<Vec<_>>(),
+        ["fast ours", "fast pivot", "balanced ours", "balanced pivot"]
+    );
+    for row in rows {
+        let turns = row["novel_views_by_turn"].as_array().unwrap();
+        let told: Vec<_> = turns.iter().map(|turn| (number(turn, "turn_rad"), number(turn, "count"))).collect();
+        assert_eq!(told, [(0.2, 4.0), (0.4, 4.0)], "{row}");
+        assert!(turns.iter().all(|turn| number(turn, "psnr") > 0.0 && number(turn, "foreground_psnr") > 0.0));
+    }
+    let chart = String::from_utf8(folder.read("charts/psnr_over_effort.svg")).unwrap();
+    assert!(is_chart(&folder, "charts/psnr_over_effort.svg") && chart.contains("ours, views not shown"));
+    assert!(!folder.path("charts/lpips_over_effort.svg").exists(), "there are no weights to measure it by");
+    assert_eq!(folder.list("made"), ["00000.cnerf", "00005.cnerf"]);
+    let kept = folder.json("info made/00000.cnerf");
+    let first = report["variants"][0]["portraits"].as_array().unwrap();
+    let first = first.iter().find(|score| score["input"] == "images/00000.png").unwrap();
+    assert_eq!(number(&kept["metrics"], "psnr"), number(first, "psnr"));
+
+    let refused = folder.run(&line.replace("--plots charts ", ""));
+    assert!(refused.code == 2 && refused.stderr.contains("--overwrite"), "{}", refused.stderr);
+    let both = folder.run(&format!("{line} --effort fast --overwrite"));
+    assert_eq!(both.code, 2, "{}", both.stderr);
+    let locality = folder.json(&format!("eval locality made/00000.cnerf made/00005.cnerf --model {MODEL}"));
+    assert_eq!(number(&locality, "texture_depth_change"), 0.0);
+}
+
+#[test]
 fn photos_that_cannot_be_inverted_are_counted() {
     let folder = Folder::with_model("failures");
     folder.photo("photos_astronaut.png");

@@ -147,6 +147,113 @@ fn codes_of_another_portrait_and_of_the_mean_are_taken_once() {
     }
 }
 
+/// The codes in a portrait file, a row of bytes for each region.
+fn codes(folder: &Folder, name: &str) -> Vec<Vec<u8>> {
+    let bytes = folder.read(name);
+    let codes = safetensors::SafeTensors::deserialize(&bytes).unwrap().tensor("codes").unwrap().data().to_vec();
+    codes.chunks_exact(codes.len() / 9).map(<[u8]>::to_vec).collect()
+}
+
+#[test]
+fn amounts_mix_and_exaggerate() {
+    let folder = folder_with_portraits("amount");
+    let line = format!("edit a.cnerf --model {MODEL} --region hair --from b.cnerf");
+    let change = |amount: &str| {
+        let report = folder.json(&format!("{line} --amount {amount} --out at{amount}.cnerf"));
+        number(&report, "inside_change")
+    };
+    assert_eq!(change("0"), 0.0);
+    let [half, whole, beyond] = ["0.5", "1", "-1.5"].map(change);
+    assert!(half > 0.0 && whole > half && beyond > 0.0, "{half} {whole} {beyond}");
+    let numbers = |name: &str| -> Vec<f32> {
+        codes(&folder, name)[7].chunks_exact(4).map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect()
+    };
+    let (from, to) = (numbers("a.cnerf"), numbers("b.cnerf"));
+    for (name, amount) in [("at0.5.cnerf", 0.5), ("at-1.5.cnerf", -1.5)] {
+        for ((found, from), to) in numbers(name).iter().zip(&from).zip(&to) {
+            assert!((found - (from + amount * (to - from))).abs() < 1e-4, "{name}: {found} {from} {to}");
+        }
+    }
+    let refused = folder.run(&format!("{line} --amount 11 --out far.cnerf"));
+    assert_eq!((refused.code, refused.stderr.lines().count()), (2, 1), "{}", refused.stderr);
+    assert!(refused.stderr.contains("--amount"), "{}", refused.stderr);
+}
+
+#[test]
+fn regions_take_their_own_sources_and_are_given_back_one_by_one() {
+    let folder = folder_with_portraits("sources");
+    let line = format!("edit a.cnerf --model {MODEL}");
+    folder.json(&format!("{line} --region all --seed 5 --out c.cnerf"));
+    let report = folder.json(&format!(
+        "{line} --region hair --from b.cnerf --region mouth,nose --from c.cnerf --texture --out mixed.cnerf"
+    ));
+    assert!(number(&report, "inside_change") > 0.0 && number(&report, "depth_change") == 0.0, "{report}");
+    let [a, b, c, mixed] = ["a", "b", "c", "mixed"].map(|name| codes(&folder, &format!("{name}.cnerf")));
+    for region in 0..9 {
+        let from = match region {
+            7 => &b,
+            4 | 5 => &c,
+            _ => &a,
+        };
+        let (shape, texture) = mixed[region].split_at(a[region].len() / 2);
+        assert_eq!(shape, &a[region][..shape.len()], "shape of region {region}");
+        assert_eq!(texture, &from[region][shape.len()..], "texture of region {region}");
+    }
+    // Two edits, two steps back.
+    folder.json(&format!("edit mixed.cnerf --model {MODEL} --undo --out once.cnerf"));
+    let once = codes(&folder, "once.cnerf");
+    assert!(once[7] == mixed[7] && once[4] == a[4] && once[5] == a[5]);
+    folder.json(&format!("edit once.cnerf --model {MODEL} --undo --out twice.cnerf"));
+    assert!(codes(&folder, "twice.cnerf") == a);
+}
+
+#[test]
+fn edits_that_say_too_little_or_too_much_are_refused() {
+    let folder = folder_with_portraits("unclear");
+    for (options, said) in [
+        ("--seed 1", "--region"),
+        ("--region hair", "--from PORTRAIT"),
+        ("--region hair --seed 1 --mean", "--seed"),
+        ("--region hair --from b.cnerf --mean", "--mean"),
+        ("--region hair --region eyes --region nose --from a.cnerf --from b.cnerf", "2 --from for 3 --region"),
+        ("--region hair --color hair=#ffffff", "--color"),
+        ("--color hair=brown", "hair=brown"),
+        ("--undo --region hair", "--region"),
+        ("--region hair --from gone.cnerf", "gone.cnerf"),
+    ] {
+        let run = folder.run(&format!("edit a.cnerf --model {MODEL} {options} --out x.cnerf"));
+        assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{options}: {}", run.stderr);
+        assert!(run.stderr.contains(said), "{options}: {}", run.stderr);
+    }
+    assert!(!folder.path("x.cnerf").exists());
+}
+
+#[test]
+fn shells_and_readers_of_manuals_get_every_command() {
+    let folder = Folder::new("shell");
+    for line in ["completions bash", "completions fish", "man"] {
+        let said = folder.run(line).done().stdout;
+        for command in ["invert", "edit", "render", "export", "eval", "synth"] {
+            assert!(said.contains(command), "`{line}` has no `{command}`");
+        }
+    }
+}
+
+#[test]
+fn heads_are_seen_from_where_their_cameras_are_turned() {
+    let folder = Folder::new("turns");
+    folder.run("synth --count 2 --size 32 --turns -0.4,0.2 --out turned").done();
+    let items = items(&folder, "turned");
+    assert_eq!(items.len(), 6);
+    for head in items.chunks_exact(3) {
+        let turn = |index: usize| number(&head[index], "azimuth") - number(&head[0], "azimuth");
+        assert!((turn(1) + 0.4).abs() < 1e-6 && (turn(2) - 0.2).abs() < 1e-6, "{head:?}");
+        assert!(head.iter().all(|item| item["head"] == head[0]["head"]));
+    }
+    let refused = folder.run("synth --count 2 --size 32 --turns 2 --out far");
+    assert_eq!((refused.code, refused.stderr.lines().count()), (2, 1), "{}", refused.stderr);
+}
+
 #[test]
 fn animations_run_as_fast_as_told_and_meshes_hold_the_regions_named() {
     let folder = folder_with_portraits("frames");

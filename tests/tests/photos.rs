@@ -135,6 +135,60 @@ fn regions_are_found_without_help_unless_nobody_is_to_look() {
 }
 
 #[test]
+fn a_map_made_by_hand_gives_the_regions_and_must_fit_the_photo() {
+    let folder = Folder::with_model("mask");
+    for (from, to) in [("images", "drawn.png"), ("masks", "mask.png")] {
+        fs::copy(folder.path("../shared/data").join(from).join("00002.png"), folder.path(to)).unwrap();
+    }
+    let line = format!("invert drawn.png --aligned --model {MODEL} {FEW_STEPS} --overwrite --out");
+    let by_hand = folder.json(&format!("{line} by_hand --mask mask.png"))["portraits"][0].clone();
+    let unknown = folder.json(&format!("{line} unknown --parser none"))["portraits"][0].clone();
+    assert!(number(&by_hand, "mask_miou") > 0.0 && unknown["mask_miou"].is_null(), "{by_hand} {unknown}");
+    assert!(folder.read("by_hand/drawn.cnerf") != folder.read("unknown/drawn.cnerf"), "the map changes nothing");
+    image::GrayImage::new(100, 64).save(folder.path("wide.png")).unwrap();
+    let two = format!("invert drawn.png mask.png --aligned --model {MODEL} --out two");
+    for (line, said) in [
+        (format!("{line} wide --mask wide.png"), vec!["wide.png", "100x64", "64x64"]),
+        (format!("{two} --mask mask.png"), vec!["--mask", "one photo"]),
+        (format!("{two} --pose 0,0"), vec!["--pose", "one photo"]),
+        (format!("{line} pose --pose 0.2"), vec!["--pose", "azimuth,elevation"]),
+        (format!("{line} pose --pose 0.2,9"), vec!["--pose", "azimuth,elevation"]),
+    ] {
+        let run = folder.run(&line);
+        assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{line}: {}", run.stderr);
+        assert!(said.iter().all(|words| run.stderr.contains(words)), "{line}: {}", run.stderr);
+    }
+}
+
+#[test]
+fn small_faces_are_refused_and_crops_beyond_the_photo_are_mirrored_and_told() {
+    let folder = Folder::with_model("framing");
+    folder.photo("astronaut.png");
+    let astronaut = folder.picture("astronaut.png");
+    imageops::resize(&astronaut, 210, 210, imageops::FilterType::Triangle).save(folder.path("small.png")).unwrap();
+    // Her crop reaches from about 137 to 312: a sixth of it is cut off.
+    imageops::crop_imm(&astronaut, 168, 0, 344, 512).to_image().save(folder.path("cut.png")).unwrap();
+    let line = format!("--model {MODEL} {FEW_STEPS} --no-progress --out out");
+    let run = folder.run(&format!("invert small.png {line}"));
+    assert_eq!((run.code, run.stderr.lines().count()), (2, 1), "{}", run.stderr);
+    assert!(run.stderr.contains("small.png: the face is ") && run.stderr.contains("44"), "{}", run.stderr);
+    let run = folder.run(&format!("invert cut.png {line}")).done();
+    assert!(run.stderr.contains("of the crop lies beyond the photo, mirrored"), "{}", run.stderr);
+}
+
+#[test]
+fn portraits_of_the_shipped_models_stay_small() {
+    let folder = Folder::new("size");
+    folder.photo("astronaut.png");
+    for model in ["portrait", "cartoon"] {
+        let line = format!("invert astronaut.png --model {model} --effort fast --pivot-steps 1 --tune-steps 1");
+        folder.run(&format!("{line} --out {model}")).done();
+        let bytes = folder.read(&format!("{model}/astronaut.cnerf")).len();
+        assert!(bytes <= 2_000_000, "{model}: {bytes} bytes");
+    }
+}
+
+#[test]
 fn a_parser_is_trained_stopped_resumed_measured_and_used() {
     let folder = Folder::with_model("train_parser");
     folder.photo("astronaut.png");
@@ -178,6 +232,7 @@ fn a_face_parser_gives_the_regions() {
     assert!(run.stderr.contains("regions parsed in"), "{}", run.stderr);
     assert!(number(&run.json()["portraits"][0], "mask_miou") > 0.0);
 }
+
 #[test]
 fn photos_of_one_person_share_codes_and_keep_their_cameras() {
     let folder = Folder::with_model("same_person");

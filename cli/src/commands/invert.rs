@@ -7,12 +7,13 @@ use std::{
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use cnerf_core::{data::picture, eval::perceptual::Perceptual, model::generator::Generator};
+use cnerf_core::{data::picture, model::generator::Generator};
 use cnerf_invert::{
     checkpoint,
     config::InvertConfig,
     events::Event,
     inverter::{Inversion, Inverter, estimate_seconds},
+    likeness::Likeness,
     parser::{ParserConfig, RegionParser},
     photo::{PhotoOptions, Subject},
     portrait::Portrait,
@@ -58,7 +59,7 @@ pub struct InvertArguments {
     /// The photos show one person: share codes and tuned weights, with a camera for each
     #[arg(long)]
     same_person: bool,
-    /// LPIPS weights (AlexNet or VGG16, safetensors) for a perceptual loss
+    /// LPIPS weights (AlexNet or VGG16, safetensors) for the perceptual loss, in place of the built-in parser's features
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
     #[command(flatten)]
@@ -74,7 +75,7 @@ pub struct InvertArguments {
 #[derive(Clone, Copy)]
 struct Tools<'a> {
     generator: &'a Generator,
-    perceptual: Option<&'a Perceptual>,
+    likeness: &'a Likeness,
     parser: Option<&'a dyn RegionParser>,
     near: Option<&'a NearStart>,
     interrupt: &'a Interrupt,
@@ -149,12 +150,12 @@ impl InvertArguments {
             }
         }
         let generator = self.model.load_or("portrait")?;
-        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
+        let likeness = Likeness::load(self.lpips.as_deref(), cnerf_models::parser(), &generator.device())?;
         let parser = self.parser.load(cnerf_models::parser())?;
         let interrupt = Interrupt::listen()?;
         let near = self.model.near_start("portrait")?;
-        let (perceptual, parser, near) = (perceptual.as_ref(), parser.as_deref(), near.as_ref());
-        let tools = Tools { generator: &generator, perceptual, parser, near, interrupt: &interrupt };
+        let (parser, near) = (parser.as_deref(), near.as_ref());
+        let tools = Tools { generator: &generator, likeness: &likeness, parser, near, interrupt: &interrupt };
         let mut report = Report::default();
         let groups: Vec<&[PathBuf]> =
             if self.same_person { vec![self.photos.as_slice()] } else { self.photos.chunks(1).collect() };
@@ -218,7 +219,7 @@ impl InvertArguments {
 
     /// Says how long it will take, before it does.
     fn tell_time(&self, tools: &Tools<'_>, console: &Console) -> anyhow::Result<()> {
-        let seconds = estimate_seconds(tools.generator, &self.config, tools.perceptual)?;
+        let seconds = estimate_seconds(tools.generator, &self.config, Some(tools.likeness))?;
         let (effort, count) = (self.config.effort.name(), self.photos.len());
         let photos = match (count, self.same_person) {
             (1, _) => "the photo".to_owned(),
@@ -277,12 +278,12 @@ impl InvertArguments {
         report: &mut Report,
         console: &Console,
     ) -> anyhow::Result<()> {
-        let Tools { generator, perceptual, .. } = *tools;
+        let Tools { generator, likeness, .. } = *tools;
         let (paths, subjects): (Vec<&Path>, Vec<Subject>) = photos.into_iter().unzip();
         let Some(first) = paths.first() else { return Ok(()) };
         let began = Instant::now();
         let model_name = self.model.model.as_deref().unwrap_or("portrait");
-        let mut inverter = Inverter::of_person(generator, model_name, subjects, self.config.clone(), perceptual)?;
+        let mut inverter = Inverter::of_person(generator, model_name, subjects, self.config.clone(), Some(likeness))?;
         let part = checkpoint::path_of(&self.output(first));
         if self.resume && part.exists() {
             inverter.resume(&part)?;

@@ -19,6 +19,7 @@ use cnerf_core::{
         trajectory::Trajectory,
     },
 };
+use cnerf_invert::{inverter::Opened, portrait::Portrait};
 use image::RgbImage;
 use serde::Serialize;
 
@@ -87,6 +88,8 @@ struct Report {
 
 /// One end of a blend.
 struct Key {
+    /// The portrait's file and its model's hash: what may be blended with it.
+    named: Option<(PathBuf, String)>,
     generator: Generator,
     codes: Tensor,
     global: Option<Tensor>,
@@ -195,17 +198,28 @@ impl RenderArguments {
             let Some(seed) = seed else { bail!("name a portrait file, or pass --seed S for a random portrait") };
             let generator = self.model.load_or("portrait")?;
             let codes = generator.codes_from_seed(seed, self.trunc)?;
-            return Ok(vec![Key { generator, codes, global: None }]);
+            return Ok(vec![Key { named: None, generator, codes, global: None }]);
         }
         if seed.is_some() {
             bail!("--seed renders a random portrait; leave it out where portrait files are named");
         }
-        self.portraits.iter().map(|path| self.key(path)).collect()
+        let keys: Vec<Key> = self.portraits.iter().map(|path| self.key(path)).collect::<anyhow::Result<_>>()?;
+        for (one, other) in keys.iter().zip(keys.iter().skip(1)) {
+            if let (Some((path, hash)), Some((other, found))) = (&one.named, &other.named)
+                && hash != found
+            {
+                let (path, other) = (path.display(), other.display());
+                bail!("{path} and {other} belong to different models (hashes {hash} and {found}): they do not blend");
+            }
+        }
+        Ok(keys)
     }
 
     fn key(&self, path: &Path) -> anyhow::Result<Key> {
-        let opened = portraits::open(path, &self.model)?;
-        Ok(Key { generator: opened.generator, codes: opened.codes, global: opened.global })
+        let portrait = Portrait::load(path)?;
+        let model = portraits::model_of(&portrait, path, &self.model)?;
+        let Opened { generator, codes, global, .. } = Opened::new(&portrait, path, &model)?;
+        Ok(Key { named: Some((path.to_owned(), portrait.model.hash)), generator, codes, global })
     }
 
     /// Frame `index`: between two portraits codes and tuned weights move together.
@@ -247,9 +261,6 @@ impl Key {
 }
 
 fn mix(from: &Key, to: &Key, amount: f64) -> anyhow::Result<Key> {
-    if from.generator.config() != to.generator.config() {
-        bail!("the portraits belong to different models and cannot be blended");
-    }
     let between = |a: &Tensor, b: &Tensor| -> candle_core::Result<Tensor> { (a * (1.0 - amount))? + (b * amount)? };
     let (start, end) = (from.generator.parameters().snapshot()?, to.generator.parameters().snapshot()?);
     let weights = start
@@ -266,7 +277,7 @@ fn mix(from: &Key, to: &Key, amount: f64) -> anyhow::Result<Key> {
     let device = from.generator.device();
     let generator = Generator::from_tensors(from.generator.config(), weights, &device)?;
     let generator = generator.with_budget(from.generator.render_settings().budget);
-    Ok(Key { generator, codes: between(&from.codes, &to.codes)?, global })
+    Ok(Key { named: None, generator, codes: between(&from.codes, &to.codes)?, global })
 }
 
 fn grid(text: &str) -> Result<[usize; 2], String> {

@@ -54,9 +54,15 @@ pub struct SynthOptions {
     /// Width and height of the pictures, pixels.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = 256))]
     pub size: usize,
-    /// Cameras per head; every one gives a picture.
+    /// Cameras drawn per head; every one gives a picture.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = 1))]
     pub views: usize,
+    /// After each drawn camera, pictures from cameras turned from it in azimuth by so many radians, e.g. -0.4,-0.2,0.2,0.4.
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "RAD[,RAD]", value_delimiter = ',', allow_hyphen_values = true)
+    )]
+    pub turns: Vec<f64>,
     /// Standard deviation of the cameras' azimuth, radians.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = 0.4))]
     pub azimuth_sigma: f64,
@@ -67,14 +73,19 @@ pub struct SynthOptions {
 
 impl Default for SynthOptions {
     fn default() -> Self {
-        Self { count: 64, size: 256, views: 1, azimuth_sigma: 0.4, elevation_sigma: 0.2 }
+        Self { count: 64, size: 256, views: 1, turns: Vec::new(), azimuth_sigma: 0.4, elevation_sigma: 0.2 }
     }
 }
 
 impl SynthOptions {
     /// Number of pictures: heads × cameras.
     pub fn len(&self) -> usize {
-        self.count.saturating_mul(self.views)
+        self.count.saturating_mul(self.cameras_per_head())
+    }
+
+    /// Cameras of each head, drawn and turned.
+    pub fn cameras_per_head(&self) -> usize {
+        self.views.saturating_mul(1 + self.turns.len())
     }
 
     /// Whether there is nothing to make.
@@ -93,6 +104,9 @@ impl SynthOptions {
         if self.is_empty() {
             return Err(Error::config(if self.count == 0 { "count" } else { "views" }, "must be at least 1"));
         }
+        if let Some(turn) = self.turns.iter().find(|turn| !(-1.6..=1.6).contains(*turn)) {
+            return Err(Error::config("turns", format!("{turn} is outside -1.6 to 1.6 radians")));
+        }
         for (name, sigma) in [("azimuth-sigma", self.azimuth_sigma), ("elevation-sigma", self.elevation_sigma)] {
             if !(0.0..=10.0).contains(&sigma) {
                 return Err(Error::config(name, format!("{sigma} is outside 0 to 10 radians")));
@@ -106,19 +120,22 @@ impl SynthOptions {
         Stream::new(seed, &[HEADS, head as u64]).bits()
     }
 
-    /// A head's camera: Gaussian angles, clamped to ±1.2 rad azimuth and ±0.6 rad elevation.
+    /// A head's camera: Gaussian angles, clamped to ±1.2 rad azimuth and ±0.6 rad elevation; then turned, if it is not
+    /// the first after a draw.
     pub fn camera(&self, seed: u64, head: usize, view: usize) -> Camera {
-        let mut stream = Stream::new(seed, &[CAMERAS, head as u64, view as u64]);
+        let (drawn, place) = (view / (1 + self.turns.len()), view % (1 + self.turns.len()));
+        let mut stream = Stream::new(seed, &[CAMERAS, head as u64, drawn as u64]);
         let azimuth = self.azimuth_sigma * f64::from(stream.normal());
         let elevation = self.elevation_sigma * f64::from(stream.normal());
-        Camera::at(azimuth.clamp(-1.2, 1.2), elevation.clamp(-0.6, 0.6))
+        let turn = place.checked_sub(1).and_then(|place| self.turns.get(place)).copied().unwrap_or(0.0);
+        Camera::at(azimuth.clamp(-1.2, 1.2) + turn, elevation.clamp(-0.6, 0.6))
     }
 }
 
 /// One picture of a synthetic dataset.
 #[derive(Clone, Debug)]
 pub struct SynthItem {
-    /// Place in the dataset: `head * views + view`.
+    /// Place in the dataset: `head * cameras_per_head + view`.
     pub index: usize,
     /// Number of the head.
     pub head: usize,
@@ -156,12 +173,13 @@ impl Synth {
     fn head(&self, head: usize) -> Vec<SynthItem> {
         let identity_seed = SynthOptions::identity_seed(self.seed, head);
         let portrait = Portrait::new(&Identity::sample(identity_seed));
-        (0..self.options.views)
+        let cameras = self.options.cameras_per_head();
+        (0..cameras)
             .into_par_iter()
             .map(|view| {
                 let camera = self.options.camera(self.seed, head, view);
                 let picture = portrait.render(&camera, self.options.size, &self.render);
-                SynthItem { index: head * self.options.views + view, head, view, identity_seed, camera, picture }
+                SynthItem { index: head * cameras + view, head, view, identity_seed, camera, picture }
             })
             .collect()
     }
@@ -173,7 +191,7 @@ impl Iterator for Synth {
     fn next(&mut self) -> Option<SynthItem> {
         if self.ready.is_empty() {
             // Enough heads to keep all threads busy, few enough to keep memory small.
-            let heads = (2 * rayon::current_num_threads()).div_ceil(self.options.views.max(1)).max(1);
+            let heads = (2 * rayon::current_num_threads()).div_ceil(self.options.cameras_per_head().max(1)).max(1);
             let end = self.next_head.saturating_add(heads).min(self.options.count);
             let batch: Vec<Vec<SynthItem>> =
                 (self.next_head..end).into_par_iter().map(|head| self.head(head)).collect();
@@ -184,7 +202,7 @@ impl Iterator for Synth {
     }
 
     fn size_hint(&self) -> (usize, Option<usize>) {
-        let left = (self.options.count - self.next_head) * self.options.views + self.ready.len();
+        let left = (self.options.count - self.next_head) * self.options.cameras_per_head() + self.ready.len();
         (left, Some(left))
     }
 }

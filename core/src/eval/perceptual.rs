@@ -257,7 +257,7 @@ impl Perceptual {
 }
 
 /// Features divided by their length over channels.
-fn unit_length(features: &Tensor) -> Result<Tensor> {
+pub(crate) fn unit_length(features: &Tensor) -> Result<Tensor> {
     let length = (features.sqr()?.sum_keepdim(1)? + NORM_FLOOR)?.sqrt()?;
     Ok(features.broadcast_div(&length)?)
 }

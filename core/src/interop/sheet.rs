@@ -1,4 +1,4 @@
-//! Contact sheets: pictures in a grid, with small labels.
+//! Contact sheets: pictures in a grid, with small labels and titles over the columns.
 
 use std::{io::Cursor, path::Path};
 
@@ -20,13 +20,20 @@ const INK: Rgb<u8> = Rgb([226, 226, 232]);
 #[derive(Clone, Debug, Default)]
 pub struct Sheet {
     columns: usize,
+    titles: Vec<String>,
     cells: Vec<(RgbImage, String)>,
 }
 
 impl Sheet {
     /// An empty sheet of so many columns (at least one).
     pub fn new(columns: usize) -> Self {
-        Self { columns: columns.max(1), cells: Vec::new() }
+        Self { columns: columns.max(1), ..Self::default() }
+    }
+
+    /// An empty sheet with a column under each of these titles.
+    pub fn with_titles(titles: impl IntoIterator<Item = impl Into<String>>) -> Self {
+        let titles: Vec<String> = titles.into_iter().map(Into::into).collect();
+        Self { titles: titles.clone(), ..Self::new(titles.len()) }
     }
 
     /// An empty sheet whose columns make `count` pictures a near square that is rather wide than high.
@@ -56,20 +63,24 @@ impl Sheet {
         // Labels stay legible when a sheet of large pictures is scaled down.
         let scale = (widest / 192).clamp(1, 4);
         let label_height = if self.cells.iter().all(|(_, label)| label.is_empty()) { 0 } else { GLYPH * scale + GAP };
+        let title_height = if self.titles.is_empty() { 0 } else { GLYPH * scale + 2 * GAP };
         let (cell_width, cell_height) = (widest + GAP, highest + label_height + GAP);
         let width = columns as u64 * u64::from(cell_width) + u64::from(GAP);
-        let height = rows as u64 * u64::from(cell_height) + u64::from(GAP);
+        let height = u64::from(title_height) + rows as u64 * u64::from(cell_height) + u64::from(GAP);
         if width.saturating_mul(height) > MAX_PIXELS {
             let reason = format!("{width} x {height} pixels are too many; ask for fewer or smaller pictures");
             return Err(Error::config("contact sheet", reason));
         }
         let mut sheet = RgbImage::from_pixel(width as u32, height as u32, PAPER);
+        let room = (widest / (GLYPH * scale)) as usize;
+        for (column, title) in self.titles.iter().take(columns).enumerate() {
+            write_label(&mut sheet, title, room, scale, [GAP + column as u32 * cell_width, GAP]);
+        }
         for (index, (picture, label)) in self.cells.iter().enumerate() {
             let left = GAP + (index % columns) as u32 * cell_width;
-            let top = GAP + (index / columns) as u32 * cell_height;
+            let top = title_height + GAP + (index / columns) as u32 * cell_height;
             let (x, y) = (left + (widest - picture.width()) / 2, top + (highest - picture.height()) / 2);
             imageops::replace(&mut sheet, picture, x.into(), y.into());
-            let room = (widest / (GLYPH * scale)) as usize;
             write_label(&mut sheet, label, room, scale, [left, top + highest + GAP / 2]);
         }
         Ok(sheet)
@@ -142,6 +153,20 @@ mod tests {
         assert!(ink(4, 36, 8) > 10 && ink(12, 36, 32) == 0, "one letter");
         assert!(ink(48, 36, 40) > 20 && ink(88, 36, 4) == 0, "cut at the cell's width");
         assert!(ink(4, 82, 8) > 5, "a character without a glyph is marked");
+    }
+
+    #[test]
+    fn titles_stand_over_their_columns() {
+        let picture = || plain(40, 30, [255, 0, 0]);
+        let sheet = Sheet::with_titles(["A", "B"]).push(picture(), "").push(picture(), "").push(picture(), "");
+        let sheet = sheet.render().unwrap();
+        let title = GLYPH + 2 * GAP;
+        assert_eq!(sheet.dimensions(), (4 + 2 * 44, title + 4 + 2 * 34));
+        for left in [4, 48] {
+            let places = (left..left + 8).flat_map(|x| (4..4 + GLYPH).map(move |y| (x, y)));
+            assert!(places.filter(|&(x, y)| *sheet.get_pixel(x, y) == INK).count() > 10, "one letter at {left}");
+            assert_eq!(sheet.get_pixel(left, title + 4).0, [255, 0, 0]);
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use image::RgbImage;
 use super::SIDE;
 use crate::{
     data::picture,
-    error::Result,
+    error::{Error, Result},
     kernels::activation::silu,
     model::layers::{Convolution, Resampling, linear},
     parameters::{Init, Parameters},
@@ -111,15 +111,21 @@ impl Network {
         })
     }
 
+    /// The maps of the way down, `[B, C, 64, 64]` to `[B, C, 8, 8]`, of packed pictures `[B, 12, 64, 64]`.
+    pub fn maps(&self, input: &Tensor) -> Result<Vec<Tensor>> {
+        let mut maps = vec![self.top.forward(&self.stem.forward(input)?)?];
+        for Down { widen, blocks } in &self.downs {
+            let Some(fine) = maps.last() else { break };
+            let coarse = widen.forward(&Resampling::AverageDown.apply(fine)?)?;
+            maps.push(blocks.iter().try_fold(coarse, |hidden, block| block.forward(&hidden))?);
+        }
+        Ok(maps)
+    }
+
     /// Reads packed pictures `[B, 12, 64, 64]`, see [`packed`].
     pub fn forward(&self, input: &Tensor) -> Result<Output> {
-        let mut hidden = self.top.forward(&self.stem.forward(input)?)?;
-        let mut skips = Vec::with_capacity(self.downs.len());
-        for Down { widen, blocks } in &self.downs {
-            let coarse = widen.forward(&Resampling::AverageDown.apply(&hidden)?)?;
-            skips.push(hidden);
-            hidden = blocks.iter().try_fold(coarse, |hidden, block| block.forward(&hidden))?;
-        }
+        let mut skips = self.maps(input)?;
+        let Some(mut hidden) = skips.pop() else { return Err(Error::shape("parser maps", "4", &[0])) };
         let (numbers, shift) = self.global.forward(&hidden)?;
         hidden = self.bottom.forward(&hidden.broadcast_add(&shift)?)?;
         for (Up { narrow, block }, skip) in self.ups.iter().zip(skips.into_iter().rev()) {
@@ -191,6 +197,13 @@ pub(super) fn packed(picture: &RgbImage) -> Vec<f32> {
         }
     }
     values
+}
+
+/// Pictures `[B, 3, 128, 128]` as the network reads them, `[B, 12, 64, 64]`; see [`packed`]. Differentiable.
+pub(super) fn packed_tensor(pictures: &Tensor) -> Result<Tensor> {
+    let batch = pictures.dim(0)?;
+    let cells = pictures.reshape(&[batch, 3, GRID, 2, GRID, 2][..])?.permute(&[0, 1, 3, 5, 2, 4][..])?;
+    Ok(cells.contiguous()?.reshape((batch, INPUTS, GRID, GRID))?)
 }
 
 /// Where a pixel of a plane lies among packed planes.

@@ -1,17 +1,17 @@
 //! `cnerf eval inversion`: how well held-out photos are inverted.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use clap::Args;
 use cnerf_core::{
-    eval::perceptual::Perceptual,
     interop::chart::{Axis, LineChart, Mark, Series, histogram},
     model::generator::Generator,
 };
 use cnerf_invert::{
-    config::InvertConfig,
+    config::{Effort, InvertConfig},
     evaluation::{EvaluationOptions, Helpers, InversionScore, InversionSummary, People, Variant, invert_one},
+    likeness::Likeness,
     parser::ParserConfig,
 };
 use serde::Serialize;
@@ -19,12 +19,12 @@ use serde::Serialize;
 use super::{PlotOptions, model_name, shown};
 use crate::{
     console::{Console, Outcome},
-    options::ModelOptions,
+    options::{ModelOptions, stem},
 };
 
-const CHARTS: [&str; 3] = ["psnr_over_time", "psnr", "novel_views"];
-/// Novel views are gathered by how far they are turned, in steps of this many radians.
-const TURN_STEP_RAD: f64 = 0.1;
+const CHARTS: [&str; 5] = ["psnr_over_time", "psnr", "novel_views", "psnr_over_effort", "lpips_over_effort"];
+/// Columns of the table: novel views turned so far, radians.
+const TURNS_SHOWN_RAD: [f64; 2] = [0.2, 0.4];
 
 /// Arguments of `cnerf eval inversion`.
 #[derive(Args, Debug)]
@@ -39,6 +39,12 @@ pub struct InversionArguments {
     /// What to measure: codes alone, tuning without what holds the geometry, or all of it; several make a table
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ours")]
     variant: Vec<Variant>,
+    /// Measure at each of these efforts, in place of --effort: a row for each, and charts of time against error
+    #[arg(long, value_enum, value_name = "EFFORT[,EFFORT]", value_delimiter = ',', conflicts_with = "effort")]
+    efforts: Vec<Effort>,
+    /// Folder for the portraits of the table's first row: `examples/inversion_sheet` and other commands take them
+    #[arg(long, value_name = "DIR")]
+    portraits: Option<PathBuf>,
     /// Tell the inverter the dataset's camera
     #[arg(long)]
     known_pose: bool,
@@ -52,7 +58,7 @@ pub struct InversionArguments {
     /// Begin at the model's mean portrait, not at a guess from photo and regions
     #[arg(long)]
     far_start: bool,
-    /// LPIPS weights (safetensors): the perceptual loss, as in `invert`, and the `lpips` column
+    /// LPIPS weights (safetensors): the perceptual loss in place of the built-in parser's features, and the `lpips` column
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
     #[command(flatten)]
@@ -65,14 +71,17 @@ pub struct InversionArguments {
 struct Report {
     model: String,
     data: PathBuf,
-    /// The first variant's means.
+    /// The first row's means.
     #[serde(flatten)]
     summary: InversionSummary,
+    /// The table's rows.
     variants: Vec<Measured>,
 }
 
+/// A row of the table.
 #[derive(Serialize)]
 struct Measured {
+    effort: Effort,
     variant: Variant,
     #[serde(flatten)]
     summary: InversionSummary,
@@ -94,24 +103,45 @@ impl InversionArguments {
         self.plots.check(&CHARTS)?;
         let people = People::open(&self.data, self.count as usize, seed)?;
         let generator = self.model.load_or("portrait")?;
-        let perceptual = self.lpips.as_ref().map(|path| Perceptual::load(path, &generator.device())).transpose()?;
+        let likeness = Likeness::load(self.lpips.as_deref(), cnerf_models::parser(), &generator.device())?;
         let parser = self.parser.load(cnerf_models::parser())?;
         let near = if self.far_start { None } else { self.model.near_start("portrait")? };
-        let helpers = Helpers { perceptual: perceptual.as_ref(), parser: parser.as_deref(), near: near.as_ref() };
-        let steps = self.config.steps();
-        console.note(format_args!(
-            "{} people of {} with `{}`: {:?}, {} steps on codes, {} on weights{}",
-            people.len(),
-            self.data.display(),
-            model_name(&self.model),
-            self.config.effort,
-            steps.pivot(),
-            steps.tune,
-            if perceptual.is_some() { "" } else { "; no --lpips: no perceptual loss, no LPIPS" },
-        ));
+        let helpers = Helpers { likeness: Some(&likeness), parser: parser.as_deref(), near: near.as_ref() };
+        let efforts = if self.efforts.is_empty() { vec![self.config.effort] } else { self.efforts.clone() };
+        let rows: Vec<(Effort, Variant)> =
+            efforts.iter().flat_map(|effort| self.variant.iter().map(|variant| (*effort, *variant))).collect();
+        if let Some(folder) = &self.portraits {
+            let mut paths: Vec<PathBuf> = (0..people.len()).map(|one| portrait_path(folder, &people, one)).collect();
+            paths.iter().try_for_each(|path| self.plots.overwrite.check(path))?;
+            paths.sort();
+            if let Some(path) = paths.iter().zip(paths.iter().skip(1)).find_map(|(a, b)| (a == b).then_some(a)) {
+                bail!("two photos would become {}: rename one, or leave --portraits out", path.display());
+            }
+        }
         let mut variants = Vec::new();
-        for variant in &self.variant {
-            variants.push(self.measure(*variant, &generator, &people, helpers, console));
+        for (row, (effort, variant)) in rows.into_iter().enumerate() {
+            let config = InvertConfig { effort, ..self.config.clone() };
+            let steps = config.steps();
+            console.note(format_args!(
+                "{} people of {} with `{}`: {}, {}, {} steps on codes, {} on weights{}",
+                people.len(),
+                self.data.display(),
+                model_name(&self.model),
+                variant.name(),
+                effort.name(),
+                steps.pivot(),
+                variant.apply(config.clone()).steps().tune,
+                if self.lpips.is_some() { "" } else { "; no --lpips: no LPIPS" },
+            ));
+            let options = EvaluationOptions {
+                config,
+                variant,
+                model_name: model_name(&self.model).to_owned(),
+                known_pose: self.known_pose,
+                known_masks: self.known_masks,
+            };
+            let folder = self.portraits.as_deref().filter(|_| row == 0);
+            variants.push(measure(&generator, &people, helpers, &options, folder, console));
         }
         let Some(first) = variants.first() else { bail!("--variant: name at least one") };
         if variants.iter().all(|measured| measured.portraits.is_empty()) {
@@ -126,82 +156,110 @@ impl InversionArguments {
         Ok(if partial { Outcome::Partial } else { Outcome::Done })
     }
 
-    fn measure(
-        &self,
-        variant: Variant,
-        generator: &Generator,
-        people: &People,
-        helpers: Helpers<'_>,
-        console: &Console,
-    ) -> Measured {
-        let options = EvaluationOptions {
-            config: self.config.clone(),
-            variant,
-            model_name: model_name(&self.model).to_owned(),
-            known_pose: self.known_pose,
-            known_masks: self.known_masks,
-        };
-        let (mut portraits, mut failures) = (Vec::new(), Vec::new());
-        let bar = console.bar(people.len() as u64, variant.name());
-        for index in 0..people.len() {
-            let input = people.name(index);
-            let result = invert_one(generator, people, index, helpers, &options, &mut |done, all| {
-                bar.set_message(format!("{input}: step {done} of {all}"));
-            });
-            match result {
-                Ok(score) => portraits.push(score),
-                Err(error) => {
-                    bar.suspend(|| console.warn(format_args!("{input}: {error}")));
-                    failures.push(Failure { input, error: error.to_string() });
-                }
-            }
-            bar.inc(1);
-        }
-        bar.finish_and_clear();
-        Measured { variant, summary: InversionSummary::of(&portraits, failures.len()), portraits, failures }
-    }
-
     fn draw(&self, variants: &[Measured]) -> anyhow::Result<()> {
-        let series = |points: fn(&[InversionScore]) -> Vec<(f64, f64)>, mark: Mark| -> Vec<Series> {
-            let one = |measured: &Measured| Series {
-                name: measured.variant.name().to_owned(),
-                points: points(&measured.portraits),
-                mark,
-            };
-            variants.iter().map(one).collect()
+        let several = variants.iter().any(|one| variants.first().is_some_and(|first| first.effort != one.effort));
+        let name = |measured: &Measured| match several {
+            true => format!("{}, {}", measured.variant.name(), measured.effort.name()),
+            false => measured.variant.name().to_owned(),
         };
-        if let Some(path) = self.plots.path("psnr_over_time") {
-            let chart = LineChart {
-                title: format!(
-                    "Error over time, mean of {} photos",
-                    variants.first().map_or(0, |one| one.portraits.len())
-                ),
-                x: Axis::linear("time, seconds").with_zero(),
-                y: Axis::linear("PSNR of what a step compared, dB"),
-                subtitle: String::new(),
-                series: series(mean_curve, Mark::Line),
-            };
-            chart.save(path)?;
-        }
+        let series = |points: &dyn Fn(&Measured) -> Vec<(f64, f64)>, mark: Mark| -> Vec<Series> {
+            variants.iter().map(|one| Series { name: name(one), points: points(one), mark }).collect()
+        };
+        let count = variants.first().map_or(0, |one| one.portraits.len());
+        let save = |name: &str, title: String, x: Axis, y: Axis, series: Vec<Series>| -> anyhow::Result<()> {
+            // A chart without a point would say nothing.
+            if let Some(path) = self.plots.path(name).filter(|_| series.iter().any(|one| !one.points.is_empty())) {
+                LineChart { title, subtitle: String::new(), x, y, series }.save(path)?;
+            }
+            Ok(())
+        };
+        save(
+            "psnr_over_time",
+            format!("Error over time, mean of {count} photos"),
+            Axis::linear("time, seconds").with_zero(),
+            Axis::linear("PSNR of what a step compared, dB"),
+            series(&|one| mean_curve(&one.portraits), Mark::Line),
+        )?;
         if let Some(path) = self.plots.path("psnr") {
-            let values = variants.iter().map(|measured| {
-                (measured.variant.name().to_owned(), measured.portraits.iter().map(|score| score.psnr).collect())
-            });
+            let values = variants.iter().map(|one| (name(one), one.portraits.iter().map(|score| score.psnr).collect()));
             histogram("Inverted photos", Axis::linear("PSNR, dB"), &values.collect::<Vec<_>>()).save(path)?;
         }
-        let novel = series(by_turn, Mark::LineAndDots);
-        if let Some(path) = self.plots.path("novel_views").filter(|_| novel.iter().any(|one| !one.points.is_empty())) {
-            let chart = LineChart {
-                title: "Views that were not shown".into(),
-                subtitle: String::new(),
-                x: Axis::linear("turn of azimuth from the photo, radians").with_zero(),
-                y: Axis::linear("PSNR, dB"),
-                series: novel,
-            };
-            chart.save(path)?;
+        let by_turn = |one: &Measured| {
+            one.summary.novel_views_by_turn.iter().map(|turn| (turn.turn_rad, turn.psnr)).collect::<Vec<_>>()
+        };
+        save(
+            "novel_views",
+            "Views that were not shown".into(),
+            Axis::linear("turn of azimuth from the photo, radians").with_zero(),
+            Axis::linear("PSNR, dB"),
+            series(&by_turn, Mark::LineAndDots),
+        )?;
+        if !several {
+            return Ok(());
         }
-        Ok(())
+        let seconds = || Axis::logarithmic("wall time of a photo, seconds");
+        let mut both = over_effort(variants, "", |found| Some(found.psnr));
+        both.extend(over_effort(variants, ", views not shown", |found| found.novel_view_psnr));
+        let title = format!("Time against error, mean of {count} photos");
+        save("psnr_over_effort", title.clone(), seconds(), Axis::linear("PSNR, dB"), both)?;
+        let distances = over_effort(variants, "", |found| found.lpips);
+        save("lpips_over_effort", title, seconds(), Axis::linear("LPIPS, less is better"), distances)
     }
+}
+
+/// Inverts everybody by one variant at one effort; portraits go to `folder`, if there is one.
+fn measure(
+    generator: &Generator,
+    people: &People,
+    helpers: Helpers<'_>,
+    options: &EvaluationOptions,
+    folder: Option<&Path>,
+    console: &Console,
+) -> Measured {
+    let (effort, variant) = (options.config.effort, options.variant);
+    let (mut portraits, mut failures) = (Vec::new(), Vec::new());
+    let bar = console.bar(people.len() as u64, variant.name());
+    for index in 0..people.len() {
+        let input = people.name(index);
+        let result = invert_one(generator, people, index, helpers, options, &mut |done, all| {
+            bar.set_message(format!("{input}: step {done} of {all}"));
+        });
+        let result = result.and_then(|(score, portrait)| {
+            folder.map_or(Ok(()), |folder| portrait.save(&portrait_path(folder, people, index)))?;
+            Ok(score)
+        });
+        match result {
+            Ok(score) => portraits.push(score),
+            Err(error) => {
+                bar.suspend(|| console.warn(format_args!("{input}: {error}")));
+                failures.push(Failure { input, error: error.to_string() });
+            }
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Measured { effort, variant, summary: InversionSummary::of(&portraits, failures.len()), portraits, failures }
+}
+
+/// Where a person's portrait goes: named like the photo, as `invert` names it.
+fn portrait_path(folder: &Path, people: &People, index: usize) -> PathBuf {
+    folder.join(stem(Path::new(&people.name(index)))).with_extension("cnerf")
+}
+
+/// For each variant a line over efforts: mean time, and what `value` takes of the means.
+fn over_effort(rows: &[Measured], suffix: &str, value: fn(&InversionSummary) -> Option<f64>) -> Vec<Series> {
+    let mut lines: Vec<Series> = Vec::new();
+    for row in rows {
+        let Some(value) = value(&row.summary) else { continue };
+        let name = format!("{}{suffix}", row.variant.name());
+        let point = (row.summary.seconds, value);
+        match lines.iter_mut().find(|line| line.name == name) {
+            Some(line) => line.points.push(point),
+            None => lines.push(Series { name, points: vec![point], mark: Mark::LineAndDots }),
+        }
+    }
+    lines.iter_mut().for_each(|line| line.points.sort_by(|a, b| a.0.total_cmp(&b.0)));
+    lines
 }
 
 /// The mean over portraits of time and PSNR after each step.
@@ -215,51 +273,30 @@ fn mean_curve(scores: &[InversionScore]) -> Vec<(f64, f64)> {
     (0..longest).map(after).collect()
 }
 
-/// Mean PSNR of novel views by how far they are turned.
-fn by_turn(scores: &[InversionScore]) -> Vec<(f64, f64)> {
-    let mut bins: std::collections::BTreeMap<u64, Vec<f64>> = std::collections::BTreeMap::new();
-    for view in scores.iter().flat_map(|score| &score.novel_views) {
-        bins.entry((view.azimuth_turn_rad.abs() / TURN_STEP_RAD).round() as u64).or_default().push(view.psnr);
-    }
-    let point = |(bin, values): (u64, Vec<f64>)| {
-        (bin as f64 * TURN_STEP_RAD, values.iter().sum::<f64>() / values.len().max(1) as f64)
+fn table(rows: &[Measured]) -> String {
+    let turned = TURNS_SHOWN_RAD.map(|turn| format!("±{turn}, dB"));
+    let heads = ["count", "failed", "seconds", "PSNR", "MS-SSIM", "LPIPS", "mIoU", "novel, dB"];
+    let heads = heads.iter().copied().chain(turned.iter().map(String::as_str)).chain(["depth", "pose, rad", "drift"]);
+    let line = |effort: &str, variant: &str, cells: Vec<String>| {
+        let cells = cells.iter().map(|cell| format!(" {cell:>9}")).collect::<String>();
+        format!("{effort:<8} {variant:<7}{cells}")
     };
-    bins.into_iter().map(point).collect()
-}
-
-fn table(variants: &[Measured]) -> String {
-    let mut lines = vec![format!(
-        "{:<8} {:>5} {:>6} {:>8} {:>6} {:>7} {:>6} {:>6} {:>9} {:>6} {:>9} {:>9}",
-        "variant",
-        "count",
-        "failed",
-        "seconds",
-        "PSNR",
-        "MS-SSIM",
-        "LPIPS",
-        "mIoU",
-        "novel, dB",
-        "depth",
-        "pose, rad",
-        "drift"
-    )];
-    lines.extend(variants.iter().map(|measured| {
-        let found = &measured.summary;
-        format!(
-            "{:<8} {:>5} {:>6} {:>8} {:>6} {:>7} {:>6} {:>6} {:>9} {:>6} {:>9} {:>9}",
-            measured.variant.name(),
-            found.count,
-            found.failed,
+    let mut lines = vec![line("effort", "variant", heads.map(str::to_owned).collect())];
+    lines.extend(rows.iter().map(|row| {
+        let found = &row.summary;
+        let mut cells = vec![
+            found.count.to_string(),
+            found.failed.to_string(),
             shown(found.seconds, 1),
             shown(found.psnr, 2),
             shown(found.ms_ssim, 3),
             shown(found.lpips, 3),
             shown(found.mask_miou, 3),
             shown(found.novel_view_psnr, 2),
-            shown(found.depth_correlation, 3),
-            shown(found.pose_error_rad, 3),
-            shown(found.depth_drift, 5),
-        )
+        ];
+        cells.extend(TURNS_SHOWN_RAD.map(|turn| shown(found.turned(turn).map(|turned| turned.psnr), 2)));
+        cells.extend([shown(found.depth_correlation, 3), shown(found.pose_error_rad, 3), shown(found.depth_drift, 5)]);
+        line(row.effort.name(), row.variant.name(), cells)
     }));
     lines.join("\n")
 }

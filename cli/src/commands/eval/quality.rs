@@ -140,7 +140,8 @@ impl QualityArguments {
         let bar = console.bar(people.len() as u64, "masks");
         let mut scores = Vec::new();
         for index in 0..people.len() {
-            scores.push(invert_one(generator, &people, index, Helpers::default(), &options, &mut |_, _| {})?);
+            let (score, _) = invert_one(generator, &people, index, Helpers::default(), &options, &mut |_, _| {})?;
+            scores.push(score);
             bar.inc(1);
         }
         bar.finish_and_clear();

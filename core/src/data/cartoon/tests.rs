@@ -35,6 +35,22 @@ fn the_same_bytes_at_any_number_of_threads() {
 }
 
 #[test]
+fn turned_cameras_follow_the_drawn_ones() {
+    let turned = SynthOptions { count: 2, size: 8, views: 2, turns: vec![-0.4, 0.2], ..SynthOptions::default() };
+    let drawn = SynthOptions { turns: Vec::new(), ..turned.clone() };
+    let items = |options: SynthOptions| synth(5, options, RenderOptions::default()).unwrap().collect::<Vec<_>>();
+    let (all, plain) = (items(turned), items(drawn));
+    assert_eq!((all.len(), plain.len()), (12, 4));
+    for (three, one) in all.chunks_exact(3).zip(&plain) {
+        assert_eq!((three[0].camera, &three[0].picture), (one.camera, &one.picture));
+        for (item, turn) in three.iter().zip([0.0, -0.4, 0.2]) {
+            assert_eq!(item.camera, Camera::at(one.camera.azimuth_rad + turn, one.camera.elevation_rad));
+            assert_eq!(item.head, one.head);
+        }
+    }
+}
+
+#[test]
 fn a_frontal_face_shows_every_region() {
     for seed in 0..6 {
         let picture = front(&identity(seed, HairStyle::Crop), 128);
@@ -186,5 +202,6 @@ fn impossible_options_are_refused_by_name() {
     let refuse = |options: SynthOptions| synth(0, options, RenderOptions::default()).unwrap_err().to_string();
     assert!(refuse(SynthOptions { size: 0, ..SynthOptions::default() }).starts_with("size"));
     assert!(refuse(SynthOptions { views: 0, ..SynthOptions::default() }).starts_with("views"));
+    assert!(refuse(SynthOptions { turns: vec![0.2, 9.0], ..SynthOptions::default() }).starts_with("turns"));
     assert!(refuse(SynthOptions { azimuth_sigma: f64::NAN, ..SynthOptions::default() }).starts_with("azimuth-sigma"));
 }
