@@ -74,6 +74,13 @@ impl Sampling {
         }
     }
 
+    /// The same range with another number of samples.
+    #[must_use]
+    pub fn with_samples(self, samples: usize) -> Self {
+        let last_interval = self.last_interval.map(|_| self.interval_of(samples));
+        Self { samples, last_interval, ..self }
+    }
+
     /// Refuses ranges and counts that cannot be sampled.
     pub fn validate(&self) -> Result<()> {
         if self.samples == 0 {

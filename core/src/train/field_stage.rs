@@ -20,7 +20,7 @@ use crate::{
     },
     parameters::Parameters,
     region::{Region, RegionSet},
-    render::{Outputs, RayBundle, RayOutput, RenderSettings, Sampling, render_rays},
+    render::{Outputs, RayBundle, RayOutput, RenderSettings, render_rays},
     rng::Stream,
     train::{
         adversarial::{Auxiliary, Pictures, R1Weights, discriminator_loss, generator_terms},
@@ -193,11 +193,7 @@ impl FieldStage {
     /// pictures and the generator's are drawn apart, as the authors' are.
     fn render(&self, codes: &Tensor, cameras: &[Camera], outputs: Outputs, random: &mut Stream) -> Result<Fakes> {
         let settings = RenderSettings { resolution: self.config.resolution, ..self.generator.render_settings() };
-        let sampling = Sampling { samples: self.config.samples, ..settings.sampling };
-        let sampling = match sampling.last_interval {
-            Some(_) => Sampling { last_interval: Some(sampling.interval()), ..sampling },
-            None => sampling,
-        };
+        let sampling = settings.sampling.with_samples(self.config.samples);
         let field = self.generator.field().portraits(codes)?;
         let parameters = Camera::parameter_tensor(cameras, &self.device)?.to_dtype(self.dtype)?;
         let pixels = camera::pixel_centres(settings.resolution, &self.device)?.to_dtype(self.dtype)?;

@@ -128,10 +128,15 @@ impl Trainer {
             ));
         }
         let trainer = Self::open(config, stage, inputs, run)?;
-        if trainer.inputs.team.leads() {
-            files::write_atomically(&run.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
-        }
+        trainer.save_config()?;
         Ok(trainer)
+    }
+
+    fn save_config(&self) -> Result<()> {
+        if self.inputs.team.leads() {
+            files::write_atomically(&self.run.join("config.toml"), self.config.to_toml()?.as_bytes())?;
+        }
+        Ok(())
     }
 
     /// Continues the run in the folder `run` from its newest checkpoint, or from its start if it has none.
@@ -155,6 +160,8 @@ impl Trainer {
             trainer.current = Some(current);
             trainer.last_checkpoint = Some(path);
         }
+        // Settings changed on resuming hold for the next resumption too.
+        trainer.save_config()?;
         Ok(trainer)
     }
 
