@@ -232,6 +232,9 @@ pub struct UpsamplerStageConfig {
     /// Weight of L1 between two views of each random portrait where both see the head, one carried to the other by the
     /// rendered depth: what is drawn stays on the surface in an orbit. Paper: 0.
     pub agreement: f64,
+    /// Weight of L1 between the backgrounds of random portraits and those of their enlarged renders: no photo tells what is
+    /// behind a portrait that nobody took, and a critic alone fills it with patterns. Paper: 0.
+    pub calm_background: f64,
     /// The second view is turned by up to this, radians; more often by less.
     pub agreement_turn_rad: f64,
     /// Steps a discriminator or critic learns alone before its verdict counts. Paper: 0.
@@ -340,6 +343,7 @@ impl TrainConfig {
                 hard_masks: true,
                 random_portraits: 1,
                 agreement: 1.0,
+                calm_background: 1.0,
                 agreement_turn_rad: 0.5,
                 discriminator_ahead_steps: 200,
                 channel_multiplier: 0.125,
@@ -412,6 +416,7 @@ impl TrainConfig {
             hard_masks: false,
             random_portraits: 16,
             agreement: 0.0,
+            calm_background: 0.0,
             agreement_turn_rad: 0.5,
             discriminator_ahead_steps: 0,
             channel_multiplier: 1.0,
@@ -465,6 +470,7 @@ impl TrainConfig {
                 crop: 16,
                 perceptual: 0.0,
                 agreement: 0.0,
+                calm_background: 0.0,
                 random_portraits: 2,
                 ..small.upsampler
             },

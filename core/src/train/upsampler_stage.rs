@@ -27,7 +27,8 @@ use crate::{
     model::{
         file::Tensors,
         generator::Generator,
-        upsampler::{Noise, Upsampler},
+        layers::Resampling,
+        upsampler::{Noise, Upsampler, UpsamplerOutput},
     },
     render::Frame,
     rng::Stream,
@@ -143,11 +144,9 @@ impl UpsamplerStage {
         if adversary.is_some() && pairs.is_none() && stage.random_portraits == 0 {
             return Err(Error::config("upsampler.random_portraits", "must be at least 1 where there are no pairs"));
         }
-        if stage.agreement > 0.0 && stage.random_portraits == 0 {
-            return Err(Error::config(
-                "upsampler.agreement",
-                "compares random portraits; set upsampler.random_portraits",
-            ));
+        if (stage.agreement > 0.0 || stage.calm_background > 0.0) && stage.random_portraits == 0 {
+            let reason = "and calm_background look at random portraits; set upsampler.random_portraits";
+            return Err(Error::config("upsampler.agreement", reason));
         }
         Ok(Self {
             average: Average::of(&generator.parameters().within("upsampler"), stage.average_half_life_images)?,
@@ -195,30 +194,39 @@ impl UpsamplerStage {
     fn random_pictures(&self, step: usize, metrics: &mut Metrics) -> Result<RandomPictures> {
         let config = &self.config;
         let judged = self.adversary.is_some() || self.critic.is_some();
-        if config.random_portraits == 0 || !(judged || config.agreement > 0.0) {
+        let taught = config.agreement > 0.0 || config.calm_background > 0.0;
+        if config.random_portraits == 0 || !(judged || taught) {
             return Ok(RandomPictures::default());
         }
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
         let views = if config.agreement > 0.0 { agreement::VIEWS } else { 1 };
         let renders = self.random_renders(config.random_portraits, views, &mut random)?;
         let square = Square::random(config.crop, self.generator.render_resolution(), &mut random);
-        if config.agreement == 0.0 {
-            let frame = square.of_frame(&renders.frame)?;
-            let output = self.generator.upsample_with(&frame, &renders.codes, None, Noise::Drawn(&mut random))?;
-            let seen = self.seen_by_critic(&output.rgb, &mut random)?;
-            let judged = Some(Judged { image: output.rgb, masks: output.masks });
-            return Ok(RandomPictures { judged, seen, loss: None });
-        }
         // Views are compared whole: squares of them would show other parts of the head.
-        let output = self.generator.upsample_with(&renders.frame, &renders.codes, None, Noise::Drawn(&mut random))?;
-        let loss = agreement::disagreement(&output.rgb, &renders.frame, &renders.cameras)?;
-        if let Some(loss) = &loss {
-            metrics.push_loss("agreement", loss)?;
+        let (frame, factor) = match config.agreement > 0.0 {
+            true => (renders.frame, self.generator.output_resolution() / self.generator.render_resolution()),
+            false => (square.of_frame(&renders.frame)?, 1),
+        };
+        let output = self.generator.upsample_with(&frame, &renders.codes, None, Noise::Drawn(&mut random))?;
+        let mut terms = Vec::new();
+        if config.agreement > 0.0
+            && let Some(loss) = agreement::disagreement(&output.rgb, &frame, &renders.cameras)?
+        {
+            metrics.push_loss("agreement", &loss)?;
+            terms.push((loss * config.agreement)?);
         }
-        let factor = self.generator.output_resolution() / self.generator.render_resolution();
-        let judged = Judged { image: square.of(&output.rgb, factor)?, masks: square.of(&output.masks, factor)? };
+        if config.calm_background > 0.0 {
+            let loss = background_detail(&output, &frame.colour)?;
+            metrics.push_loss("background", &loss)?;
+            terms.push((loss * config.calm_background)?);
+        }
+        let judged = match factor {
+            1 => Judged { image: output.rgb, masks: output.masks },
+            _ => Judged { image: square.of(&output.rgb, factor)?, masks: square.of(&output.masks, factor)? },
+        };
         let seen = self.seen_by_critic(&judged.image, &mut random)?;
-        Ok(RandomPictures { judged: Some(judged), seen, loss: loss.map(|loss| loss * config.agreement).transpose()? })
+        let loss = terms.into_iter().map(Ok).reduce(|sum: Result<Tensor>, term| Ok((sum? + term?)?)).transpose()?;
+        Ok(RandomPictures { judged: Some(judged), seen, loss })
     }
 
     /// What the critic sees of random portraits `[B, 3, side, side]`, if there is one.
@@ -387,6 +395,19 @@ impl StageRun for UpsamplerStage {
     }
 }
 
+/// Mean absolute difference between pictures and their enlarged renders `[B, 3, r, r]` where they show background.
+fn background_detail(picture: &UpsamplerOutput, render: &Tensor) -> Result<Tensor> {
+    let mut enlarged = render.clone();
+    while enlarged.dim(3)? < picture.rgb.dim(3)? {
+        enlarged = Resampling::BilinearUp.apply(&enlarged)?;
+    }
+    let background = picture.masks.narrow(1, 0, 1)?.detach();
+    let off = (&picture.rgb - enlarged)?.abs()?.mean_keepdim(1)?.mul(&background)?;
+    // At least a pixel's worth: a square of nothing but head has no background to be off.
+    let area = (background.sum_all()? + 1.0)?;
+    Ok(off.sum_all()?.div(&area)?)
+}
+
 /// Pictures as a classifier sees them in one view.
 fn seen_by(perceptual: &Perceptual, zoom: &Zoom, pictures: &Tensor) -> Result<Seen> {
     Ok(Seen { features: perceptual.features(&zoom.of(pictures)?)?, pixels: pictures.clone() })
@@ -447,6 +468,7 @@ mod tests {
         let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
         let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=1", "random_portraits=2"];
         let criticised = vec!["critic=0.1", "discriminator_ahead_steps=1", "random_portraits=1"];
+        let calm = vec!["random_portraits=1", "calm_background=1"];
         let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
         let augmented = vec![
             "adversarial=0.1",
@@ -459,6 +481,7 @@ mod tests {
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
             (alone, &["discriminator", "adversarial"][..]),
             (criticised, &["pixels", "perceptual", "critic", "criticised"][..]),
+            (calm, &["pixels", "background"][..]),
             (agreeing, &["pixels", "discriminator", "adversarial", "agreement"][..]),
             (augmented, &["adversarial", "real_sign", "augment_probability"][..]),
         ] {
