@@ -6,7 +6,7 @@ use cnerf_core::{
     data::{labels::LabelMap, picture},
     model::{field::PortraitField, generator::Generator},
     region::{REGION_COUNT, Region, RegionSet},
-    render::{Outputs, RayBundle, RayOutput, RenderSettings, Sampling, render_rays},
+    render::{Outputs, RayBundle, RayOutput, Sampling, render_rays},
     rng::Stream,
 };
 use image::RgbImage;
@@ -251,14 +251,6 @@ fn render_at(
     let rays = RayBundle::new(camera::cast(cameras, &centres, resolution, camera::FIELD_OF_VIEW_RAD)?)?;
     let depths = depths.broadcast_as((1, pixels.elem_count(), depths.dim(2)?))?.contiguous()?;
     Ok(render_rays(field, &rays, &depths, sampling, Outputs::default(), RegionSet::ALL)?)
-}
-
-/// How portraits are rendered while codes and weights move: with two thirds of a finished picture's samples. For the
-/// built-in models that is 44 dB from finished pictures, far above what an inversion reaches, and so much faster.
-pub fn working_settings(generator: &Generator) -> RenderSettings {
-    let settings = generator.render_settings();
-    let samples = (2 * settings.sampling.samples).div_ceil(3);
-    RenderSettings { sampling: settings.sampling.with_samples(samples), ..settings }
 }
 
 /// A scalar tensor's value.

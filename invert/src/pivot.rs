@@ -241,7 +241,7 @@ impl Pivot {
         };
         let pixels = focus.draw(self.steps.rays, self.config.focus, &mut random, &generator.device())?;
         let field = generator.field().portraits(&self.live_codes()?)?;
-        let sampling = objective::working_settings(generator).sampling;
+        let sampling = generator.render_settings().sampling;
         let output = objective::render_pixels(&field, camera, &pixels, level.resolution, &sampling, &mut random)?;
         let loss = objective::ray_loss(&output, level, &pixels, &self.weights())?;
         if let Some(focus) = self.focus.get_mut(index) {
@@ -304,10 +304,7 @@ pub fn whole_picture(
     camera: &Tensor,
     differentiable: bool,
 ) -> Result<Picture> {
-    let settings = match differentiable {
-        true => RenderSettings { differentiable, ..objective::working_settings(generator) },
-        false => generator.render_settings(),
-    };
+    let settings = RenderSettings { differentiable, ..generator.render_settings() };
     let frame = generator.render(codes, camera, &settings)?;
     let lifted = generator.upsample(&frame, codes, global)?;
     let (rgb, masks) =

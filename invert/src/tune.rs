@@ -248,7 +248,7 @@ impl Tune {
         let TuneConfig { depth, masks, .. } = self.config;
         let view = random.pick(&self.off_views).filter(|_| depth > 0.0 || masks > 0.0);
         let Some(view) = view else { return Ok(Tensor::zeros((), candle_core::DType::F32, &device)?) };
-        let settings = objective::working_settings(&self.generator);
+        let settings = self.generator.render_settings();
         let pixels = objective::draw_pixels(settings.resolution, SIDE_RAYS, random, &device)?;
         let field = self.generator.field().portraits(&self.frozen.codes)?;
         // Regular samples, as the pivot's depth was rendered with: only the weights' change may count.
@@ -264,7 +264,7 @@ impl Tune {
     /// Mean squared change of colours and masks on random rays of a portrait near the pivot.
     fn locality_loss(&self, original: &Generator, space: &CodeSpace, random: &mut Stream) -> Result<Tensor> {
         let device = self.generator.device();
-        let settings = objective::working_settings(&self.generator);
+        let settings = self.generator.render_settings();
         let nearby = space.near(&self.frozen.codes, self.config.locality_distance, random)?;
         let pixels = objective::draw_pixels(settings.resolution, SIDE_RAYS, random, &device)?;
         let camera = Camera::at(
@@ -301,8 +301,7 @@ fn off_views(camera: &Camera, turn_rad: f64) -> [Camera; 2] {
 /// Depth `[1, 1, r, r]`, world units, and masks `[1, 9, r, r]`.
 fn depth_and_masks(generator: &Generator, codes: &Tensor, camera: &Tensor) -> Result<(Tensor, Tensor)> {
     // Exact, as the samples of `Tune::off_view_loss` are: drift must not count what a plan leaves out.
-    let settings = objective::working_settings(generator);
-    let settings = RenderSettings { features: false, normals: false, budget: 0.0, ..settings };
+    let settings = RenderSettings { features: false, normals: false, budget: 0.0, ..generator.render_settings() };
     let frame = generator.render(codes, camera, &settings)?;
     Ok((frame.depth.detach(), frame.masks.detach()))
 }

@@ -283,7 +283,7 @@ impl TrainConfig {
             checkpoint_steps: 500,
             sample_steps: 500,
             log_steps: 20,
-            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 24, population: 256 },
+            model: GeneratorConfig { field, upsampler, camera_deviation_rad, samples: 16, population: 256 },
             warmup: WarmupConfig {
                 steps: 16_000,
                 batch: 32,

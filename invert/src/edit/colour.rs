@@ -195,7 +195,7 @@ fn descend(
     let shade = Tensor::from_vec(shades(&own, aim), (1, 3, inside.len()), &device)?;
     let view = Camera::parameter_tensor(&[*camera], &device)?;
     let resolution = opened.generator.render_resolution();
-    let sampling = objective::working_settings(&opened.generator).sampling;
+    let sampling = opened.generator.render_settings().sampling;
     for step in 0..STEPS {
         let mut random = Stream::new(0, &[STREAM, step as u64]);
         let order: Vec<u32> =

@@ -128,7 +128,7 @@ pub fn codes(opened: &Opened, camera: &Camera, painted: &LabelMap, regions: Regi
 
     let space = CodeSpace::measure(&opened.generator)?;
     let mut search = Displacement::new(&opened.codes, space, regions, Aspect::Shape, STEPS, RATE)?;
-    let sampling = objective::working_settings(&opened.generator).sampling;
+    let sampling = opened.generator.render_settings().sampling;
     let view = Camera::parameter_tensor(&[*camera], &device)?;
     for step in 0..STEPS {
         let mut random = Stream::new(0, &[STREAM, step as u64]);
