@@ -18,7 +18,7 @@ pub enum Likeness {
     /// Learnt from people's judgements; its weights come by path.
     Lpips(Perceptual),
     /// The built-in parser's features.
-    Parser(FaceParser),
+    Parser(Box<FaceParser>),
 }
 
 impl Likeness {
@@ -30,7 +30,7 @@ impl Likeness {
     pub fn load(path: Option<&Path>, built_in: &[u8], device: &Device) -> Result<Self> {
         Ok(match path {
             Some(path) => Self::Lpips(Perceptual::load(path, device)?),
-            None => Self::Parser(FaceParser::from_bytes("the built-in parser".as_ref(), built_in)?),
+            None => Self::Parser(Box::new(FaceParser::from_bytes("the built-in parser".as_ref(), built_in)?)),
         })
     }
 
