@@ -6,6 +6,7 @@ use candle_core::Tensor;
 use crate::{
     camera::Rays,
     error::{Error, Result},
+    kernels::parts::Parts,
     region::RegionSet,
 };
 
@@ -34,7 +35,7 @@ pub struct Evaluation {
     /// Colours c_i before fusion and sigmoid: `[B, k, 3, N]`.
     pub colours: Option<Tensor>,
     /// Last hidden layers: `[B, k, W, N]`.
-    pub activations: Option<Tensor>,
+    pub activations: Option<Parts>,
     /// ∇d, without unit: `[B, 3, N]`.
     pub gradient: Option<Tensor>,
 }

@@ -1,8 +1,16 @@
 //! The door to the kernels: local generators as one differentiable candle function.
 
+use std::{
+    mem,
+    sync::{Arc, Mutex, PoisonError},
+};
+
 use candle_core::{CpuStorage, CustomOp3, DType, Device, Layout, Shape, Storage, Tensor};
 
-use super::{Evaluation, Extent, Gradients, HeadShape, Outputs, Path, RegionKernel, composed};
+use super::{
+    Evaluation, Extent, Gradients, HeadShape, Outputs, Path, RegionKernel, composed,
+    parts::{Left, Parts},
+};
 use crate::Result;
 
 /// Evaluates every region at every point of its image, differentiable to first order in all three tensors; gradient
@@ -31,6 +39,36 @@ pub fn evaluate(
         }
         _ => composed::evaluate(points, weights, film, shape, outputs),
     }
+}
+
+/// [`evaluate`] for reading in parts, at a fraction of the memory traffic on the way back.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn evaluate_in_parts(
+    points: &Tensor,
+    weights: &Tensor,
+    film: &Tensor,
+    shape: HeadShape,
+    outputs: Outputs,
+) -> Result<Parts> {
+    let is_tracked = [points, weights, film].iter().any(|tensor| tensor.track_op());
+    let kernel = match Path::current()? {
+        Path::Kernel(kernel) if matches!(points.device(), Device::Cpu) && points.dtype() == DType::F32 => kernel,
+        _ => return Parts::new(composed::evaluate(points, weights, film, shape, outputs)?),
+    };
+    if !is_tracked {
+        return Parts::new(evaluate_with(kernel, points, weights, film, shape, outputs)?);
+    }
+    let (images, regions, count) = composed::check_shapes(points, weights, film, shape)?;
+    let extent = Extent { images, regions, points: count };
+    let (left, values) = (Arc::new(Left::default()), Arc::new(Mutex::new(Vec::new())));
+    let generators = LocalGenerators { kernel, shape, outputs, extent };
+    let operation = InParts { generators, values: values.clone(), left: left.clone() };
+    let knot = points.contiguous()?.apply_op3(&weights.contiguous()?, &film.contiguous()?, operation)?;
+    let values = mem::take(&mut *values.lock().unwrap_or_else(PoisonError::into_inner));
+    let values = Tensor::from_vec(values, (images, regions, shape.rows(outputs).count, count), &Device::Cpu)?;
+    Parts::tied(values, knot, left)
 }
 
 /// [`evaluate`] with the kernel of one's choice; tensors are f32 on the CPU.
@@ -104,8 +142,25 @@ impl CustomOp3 for LocalGenerators {
         upstream: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let upstream = upstream.contiguous()?;
-        let storages = [points, weights, film, &upstream].map(Tensor::storage_and_layout);
-        let [points_values, weights_values, film_values, upstream_values] =
+        let (storage, layout) = upstream.storage_and_layout();
+        match &*storage {
+            Storage::Cpu(storage) => self.backward(points, weights, film, values(storage, layout)?),
+            _ => candle_core::bail!("the local generators' kernels run on the CPU only"),
+        }
+    }
+}
+
+impl LocalGenerators {
+    /// Gradients of points, weights and FiLM, of those that a variable led to.
+    fn backward(
+        &self,
+        points: &Tensor,
+        weights: &Tensor,
+        film: &Tensor,
+        upstream: &[f32],
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let storages = [points, weights, film].map(Tensor::storage_and_layout);
+        let [points_values, weights_values, film_values] =
             storages.each_ref().map(|(storage, layout)| match &**storage {
                 Storage::Cpu(storage) => values(storage, layout),
                 _ => candle_core::bail!("the local generators' kernels run on the CPU only"),
@@ -119,13 +174,56 @@ impl CustomOp3 for LocalGenerators {
             weights: &mut weights_gradient,
             film: &mut film_gradient,
         };
-        self.kernel.backward(&evaluation, upstream_values?, gradients).map_err(into_candle)?;
+        self.kernel.backward(&evaluation, upstream, gradients).map_err(into_candle)?;
         let tensor = |values: Vec<f32>, like: &Tensor| Tensor::from_vec(values, like.shape(), &Device::Cpu);
         Ok((
             points_gradient.map(|gradient| tensor(gradient, points)).transpose()?,
             weights.track_op().then(|| tensor(weights_gradient, weights)).transpose()?,
             film.track_op().then(|| tensor(film_gradient, film)).transpose()?,
         ))
+    }
+}
+
+/// The same as one number, the knot: values go out and gradients come in beside the graph, see [`Parts`].
+struct InParts {
+    generators: LocalGenerators,
+    values: Arc<Mutex<Vec<f32>>>,
+    left: Arc<Left>,
+}
+
+impl CustomOp3 for InParts {
+    fn name(&self) -> &'static str {
+        "local-generators-in-parts"
+    }
+
+    fn cpu_fwd(
+        &self,
+        points: &CpuStorage,
+        points_layout: &Layout,
+        weights: &CpuStorage,
+        weights_layout: &Layout,
+        film: &CpuStorage,
+        film_layout: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        let (result, _) = self.generators.cpu_fwd(points, points_layout, weights, weights_layout, film, film_layout)?;
+        if let CpuStorage::F32(result) = result {
+            *self.values.lock().unwrap_or_else(PoisonError::into_inner) = result;
+        }
+        Ok((CpuStorage::F32(vec![0.0]), 1.into()))
+    }
+
+    fn bwd(
+        &self,
+        points: &Tensor,
+        weights: &Tensor,
+        film: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let generators = &self.generators;
+        let Extent { images, regions, points: count } = generators.extent;
+        let upstream = self.left.take((images * regions, generators.shape.rows(generators.outputs).count, count))?;
+        generators.backward(points, weights, film, &upstream)
     }
 }
 

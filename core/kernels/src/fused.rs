@@ -9,6 +9,7 @@ use std::{cell::RefCell, ops::Range};
 use rayon::prelude::*;
 
 use self::{
+    contribution::Contribution,
     products::TILE,
     region::{Aligned, AngleBounds, FoldedLayout, GradientLayout, PackedRegion, Plan, film_len, fold, unfold},
     tile::{ResultRows, Tile, TileGradients},
@@ -20,6 +21,7 @@ use super::{
 };
 use crate::{Error, Result};
 
+mod contribution;
 mod products;
 mod region;
 mod tile;
@@ -36,7 +38,7 @@ pub struct Fused {
     name: &'static str,
     available: fn() -> bool,
     forward: unsafe fn(&mut Scratch, &Piece<'_>, Shared),
-    backward: unsafe fn(&mut Scratch, &Piece<'_>, &[f32], &mut [f32], Shared),
+    backward: unsafe fn(&mut Scratch, &Piece<'_>, Upstream<'_>, &mut [f32], Shared),
     fold: unsafe fn(&Plan, &PackedRegion, &[f32], &[f32], &mut Aligned) -> AngleBounds,
     forward_list: unsafe fn(&mut Scratch, &Folded, &[f32], &mut [f32]),
 }
@@ -107,6 +109,18 @@ impl<'a> Piece<'a> {
         points.chunks(TILE * columns).enumerate().map(move |(tile, points)| (first + tile * TILE, points))
     }
 
+    /// The image's point `index`.
+    fn point(&self, index: usize) -> &'a [f32] {
+        let columns = self.plan.shape.point_columns();
+        let image = self.pair / self.evaluation.extent.regions * self.evaluation.extent.points;
+        &self.evaluation.points[(image + index) * columns..][..columns]
+    }
+
+    /// Where row `row` of the image's point `index` lies in a result.
+    fn place(&self, row: usize, index: usize) -> usize {
+        (self.pair * self.plan.rows.count + row) * self.evaluation.extent.points + index
+    }
+
     /// The rows of this piece's (image, region) in a result, from point `first`.
     fn rows(&self, result: Shared, first: usize) -> ResultRows {
         let stride = self.evaluation.extent.points;
@@ -116,12 +130,31 @@ impl<'a> Piece<'a> {
     }
 }
 
+/// The upstream gradient of a whole evaluation, and where it is not negligible.
+#[derive(Clone, Copy)]
+struct Upstream<'a> {
+    values: &'a [f32],
+    contribution: &'a Contribution,
+}
+
 /// One thread's memory, kept between pieces of work.
 #[derive(Default)]
 struct Scratch {
     folded: Aligned,
     room: Aligned,
     gradient: Aligned,
+    gathered: Gathered,
+}
+
+/// Points of a piece that lie apart, brought together to fill a tile.
+#[derive(Default)]
+struct Gathered {
+    /// Indices of the image's points whose upstream gradient counts.
+    indices: Vec<u32>,
+    points: Vec<f32>,
+    /// `[C, TILE]`
+    upstream: Vec<f32>,
+    points_gradient: Vec<f32>,
 }
 
 thread_local! {
@@ -172,39 +205,52 @@ unsafe fn forward_list<V: Lanes, const ROWS: usize>(
 }
 
 /// # Safety
-/// As [`forward_piece`]; `points_gradient` is null or has N · columns values for every (image, region).
+/// As [`forward_piece`]; `points_gradient` is null or has N · columns values, at first 0, for every (image, region).
 #[inline(always)]
 unsafe fn backward_piece<V: Lanes, const ROWS: usize>(
     scratch: &mut Scratch,
     piece: &Piece<'_>,
-    upstream: &[f32],
+    upstream: Upstream<'_>,
     partial: &mut [f32],
     points_gradient: Shared,
 ) {
     let plan = piece.plan;
     let (layout, gradient_layout) = (FoldedLayout::new(plan), GradientLayout::new(plan));
-    let columns = plan.shape.point_columns();
-    scratch.room.grow(Tile::room_len(plan));
-    scratch.gradient.grow(gradient_layout.len);
-    scratch.gradient.fill(0.0);
+    let Scratch { folded, room, gradient, gathered } = scratch;
+    let Gathered { indices, points, upstream: rows, points_gradient: moved } = gathered;
+    upstream.contribution.list(piece.pair, piece.points.clone(), indices);
+    let (columns, count) = (plan.shape.point_columns(), plan.rows.count);
+    room.grow(Tile::room_len(plan));
+    gradient.grow(gradient_layout.len);
+    gradient.fill(0.0);
+    points.resize(TILE * columns, 0.0);
+    rows.resize(TILE * count, 0.0);
+    moved.resize(TILE * columns, 0.0);
+    let wants_points = !points_gradient.0.is_null();
     // SAFETY: the caller's promise; all scratch memory was grown to its layout. The upstream is only read.
     unsafe {
-        let bounds = fold::<V>(plan, piece.packed, piece.weights(), piece.film(), &mut scratch.folded, true);
-        let (folded, room) = (scratch.folded.as_ptr(), scratch.room.as_mut_ptr());
-        let tile = Tile { plan, layout: &layout, folded, bounds, room };
-        let sums = scratch.gradient.as_mut_ptr();
-        for (first, points) in piece.tiles() {
-            let points_at = if points_gradient.0.is_null() {
-                points_gradient.0
-            } else {
-                points_gradient.0.add((piece.pair * piece.evaluation.extent.points + first) * columns)
-            };
-            let upstream = piece.rows(Shared(upstream.as_ptr().cast_mut()), first);
-            let gradients = TileGradients { layout: &gradient_layout, sums, points: points_at };
-            tile.backward::<V, ROWS>(points, upstream, &gradients);
+        let bounds = fold::<V>(plan, piece.packed, piece.weights(), piece.film(), folded, true);
+        let tile = Tile { plan, layout: &layout, folded: folded.as_ptr(), bounds, room: room.as_mut_ptr() };
+        for indices in indices.chunks(TILE) {
+            for (place, index) in indices.iter().enumerate() {
+                points[place * columns..][..columns].copy_from_slice(piece.point(*index as usize));
+                for row in 0..count {
+                    rows[row * TILE + place] = upstream.values[piece.place(row, *index as usize)];
+                }
+            }
+            let start = ResultRows { start: rows.as_mut_ptr(), stride: TILE, point_stride: 1 };
+            let target = if wants_points { moved.as_mut_ptr() } else { std::ptr::null_mut() };
+            let sums = TileGradients { layout: &gradient_layout, sums: gradient.as_mut_ptr(), points: target };
+            tile.backward::<V, ROWS>(&points[..indices.len() * columns], start, &sums);
+            if wants_points {
+                for (moved, index) in moved.chunks_exact(columns).zip(indices) {
+                    let place = (piece.pair * piece.evaluation.extent.points + *index as usize) * columns;
+                    std::ptr::copy_nonoverlapping(moved.as_ptr(), points_gradient.0.add(place), columns);
+                }
+            }
         }
         let (weights, film) = partial.split_at_mut(plan.shape.parameter_count());
-        unfold::<V>(plan, piece.packed, piece.film(), &scratch.gradient, weights, film);
+        unfold::<V>(plan, piece.packed, piece.film(), gradient, weights, film);
     }
 }
 
@@ -222,7 +268,7 @@ macro_rules! instruction_set {
             };
 
         mod $module {
-            use super::{Aligned, AngleBounds, Folded, PackedRegion, Piece, Plan, Scratch, Shared};
+            use super::{Aligned, AngleBounds, Folded, PackedRegion, Piece, Plan, Scratch, Shared, Upstream};
 
             /// # Safety
             /// As [`super::forward_piece`].
@@ -238,7 +284,7 @@ macro_rules! instruction_set {
             pub unsafe fn backward(
                 scratch: &mut Scratch,
                 piece: &Piece<'_>,
-                upstream: &[f32],
+                upstream: Upstream<'_>,
                 partial: &mut [f32],
                 points: Shared,
             ) {
@@ -355,6 +401,8 @@ impl RegionKernel<f32> for Fused {
         let cut = Cut::new(evaluation.extent, points.div_ceil(CHUNK_POINTS).min(enough));
         let (parameters, film_len) = (plan.shape.parameter_count(), film_len(plan.shape));
         let partial_len = parameters + film_len;
+        let contribution = Contribution::new(images * regions, plan.rows.count, points, upstream);
+        let upstream = Upstream { values: upstream, contribution: &contribution };
 
         let image_values = points * plan.shape.point_columns();
         let mut per_region = vec![0.0; if gradients.points.is_some() { images * regions * image_values } else { 0 }];

@@ -23,6 +23,7 @@ pub mod autograd;
 pub mod composed;
 pub mod conv;
 pub mod fused;
+pub mod parts;
 pub mod peak;
 pub mod plain;
 pub mod prepared;

@@ -17,10 +17,8 @@ const RAYS_A_TASK: usize = 64;
 /// # Errors
 /// If the shapes do not fit each other, or candle errs.
 pub fn weighted_ray_sum(values: &Tensor, share: &Tensor, samples: usize) -> Result<Tensor> {
+    check(values, share, samples)?;
     let (batch, regions, channels, points) = values.dims4()?;
-    if share.dims() != [batch, regions, points] || samples == 0 || points % samples != 0 {
-        return Err(Error::shape("share", [batch, regions, points], share.dims()));
-    }
     let fits = |tensor: &Tensor| tensor.device().is_cpu() && tensor.dtype() == DType::F32;
     if fits(values) && fits(share) && !crate::Path::is_composed()? {
         let values = if values.stride().last() == Some(&1) { values.clone() } else { values.contiguous()? };
@@ -30,8 +28,27 @@ pub fn weighted_ray_sum(values: &Tensor, share: &Tensor, samples: usize) -> Resu
     Ok(weighted.reshape((batch, regions, channels, points / samples, samples))?.sum(D::Minus1)?)
 }
 
-struct RaySum {
+/// Refuses shapes that do not fit each other.
+pub(crate) fn check(values: &Tensor, share: &Tensor, samples: usize) -> Result<()> {
+    let (batch, regions, _, points) = values.dims4()?;
+    if share.dims() != [batch, regions, points] || samples == 0 || points % samples != 0 {
+        return Err(Error::shape("share", [batch, regions, points], share.dims()));
+    }
+    Ok(())
+}
+
+/// The gradient of `share` where `gradient` `[B, k, C, R]`, contiguous, is that of the sums.
+pub(crate) fn gradient_of_share(
+    values: &Tensor,
+    share: &Tensor,
+    gradient: &Tensor,
     samples: usize,
+) -> candle_core::Result<Tensor> {
+    values.apply_op3_no_bwd(share, gradient, &RaySumGradient { samples, of: Argument::Share })
+}
+
+pub(crate) struct RaySum {
+    pub samples: usize,
 }
 
 impl CustomOp2 for RaySum {
@@ -67,9 +84,12 @@ impl CustomOp2 for RaySum {
         gradient: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
         let gradient = gradient.contiguous()?;
-        let of = |of| values.apply_op3_no_bwd(share, &gradient, &RaySumGradient { samples: self.samples, of });
-        let of_values = values.track_op().then(|| of(Argument::Values)).transpose()?;
-        Ok((of_values, share.track_op().then(|| of(Argument::Share)).transpose()?))
+        let of_values = || {
+            let operation = RaySumGradient { samples: self.samples, of: Argument::Values };
+            values.apply_op3_no_bwd(share, &gradient, &operation)
+        };
+        let of_share = || gradient_of_share(values, share, &gradient, self.samples);
+        Ok((values.track_op().then(of_values).transpose()?, share.track_op().then(of_share).transpose()?))
     }
 }
 

@@ -14,7 +14,7 @@ use crate::{
         SHAPE_LAYERS, SdfHead, TEXTURE_LAYERS,
     },
     error::{Error, Result},
-    kernels::{HeadShape, Outputs, autograd},
+    kernels::{HeadShape, Outputs, autograd, parts::Parts},
     parameters::{Init, Parameters},
     region::{REGION_COUNT, Region, RegionSet},
     render::{
@@ -284,14 +284,14 @@ struct Kernel {
 
 impl Kernel {
     /// `[B, k, C, N]` at world `points` `[B, N, 3]`.
-    fn evaluate(&self, points: &Tensor, view_directions: Option<&Tensor>, outputs: Outputs) -> Result<Tensor> {
+    fn evaluate(&self, points: &Tensor, view_directions: Option<&Tensor>, outputs: Outputs) -> Result<Parts> {
         let inputs = (points * INPUT_SCALE)?;
         let inputs = match (self.shape.point_columns(), view_directions) {
             (6, Some(directions)) => Tensor::cat(&[&inputs, directions], 2)?,
             (6, None) => Tensor::cat(&[&inputs, &inputs.zeros_like()?], 2)?,
             _ => inputs,
         };
-        Ok(autograd::evaluate(&inputs, &self.weights, &self.film, self.shape, outputs)?)
+        Ok(autograd::evaluate_in_parts(&inputs, &self.weights, &self.film, self.shape, outputs)?)
     }
 
     fn local(&self, portrait: usize) -> Result<LocalWeights> {
@@ -339,7 +339,8 @@ impl PortraitField {
         }
         if let Some(network) = &self.initial {
             let rows = network.shape.rows(Outputs { gradient, ..Outputs::default() });
-            let raw = network.evaluate(points, None, Outputs { gradient, ..Outputs::default() })?.squeeze(1)?;
+            let raw =
+                network.evaluate(points, None, Outputs { gradient, ..Outputs::default() })?.tensor()?.squeeze(1)?;
             let slope = match rows.residual_gradient {
                 Some(range) => Some((raw.narrow(1, range.start, range.len())? * INPUT_SCALE)?),
                 None => None,
@@ -411,24 +412,18 @@ impl RadianceField for PortraitField {
     fn evaluate(&self, points: &Tensor, view_directions: Option<&Tensor>, outputs: Outputs) -> Result<Evaluation> {
         let rows = self.volume.shape.rows(outputs);
         let raw = self.volume.evaluate(points, view_directions, outputs)?;
-        // The gradient of every part of a tensor is as large as the whole: the few rows before the activations are cut
-        // off in one piece, and the rest is cut from that.
-        let few = match &rows.activations {
-            Some(range) => raw.narrow(2, 0, range.start)?,
-            None => raw.clone(),
-        };
-        let row = |index: usize| -> Result<Tensor> { Ok(few.narrow(2, index, 1)?.squeeze(2)?) };
-        let cut = |from: &Tensor, range: Option<std::ops::Range<usize>>| -> Result<Option<Tensor>> {
-            range.map(|range| Ok(from.narrow(2, range.start, range.len())?)).transpose()
+        let one = |row: usize| -> Result<Tensor> { Ok(raw.rows(row..row + 1)?.tensor()?.squeeze(2)?) };
+        let cut = |rows: Option<std::ops::Range<usize>>| -> Result<Option<Tensor>> {
+            rows.map(|rows| Ok(raw.rows(rows)?.tensor()?)).transpose()
         };
         let scale = self.config.residual_scale;
-        let masks = self.fuse(&row(rows.mask)?)?;
-        let residuals = (row(rows.residual)? * scale)?;
+        let masks = self.fuse(&one(rows.mask)?)?;
+        let residuals = (one(rows.residual)? * scale)?;
         let mut distance = match self.config.residual {
             Residual::Sum => residuals.sum(1)?,
             Residual::Gated => (&masks * &residuals)?.sum(1)?,
         };
-        let mut gradient = match (cut(&few, rows.mask_gradient)?, cut(&few, rows.residual_gradient)?) {
+        let mut gradient = match (cut(rows.mask_gradient)?, cut(rows.residual_gradient)?) {
             (Some(mask), Some(residual)) => {
                 let residual = (residual * (scale * INPUT_SCALE))?;
                 Some(self.residual_gradient(&masks, &residuals, &(mask * INPUT_SCALE)?, &residual)?)
@@ -451,8 +446,8 @@ impl RadianceField for PortraitField {
             distance,
             masks,
             residuals,
-            colours: cut(&few, rows.colour)?,
-            activations: cut(&raw, rows.activations)?,
+            colours: cut(rows.colour)?,
+            activations: rows.activations.map(|rows| raw.rows(rows)).transpose()?,
             gradient,
         })
     }
@@ -481,7 +476,7 @@ impl RadianceField for PortraitField {
         let Some(kernel) = &self.background else { return Ok(None) };
         let outputs = Outputs { colour: true, activations, gradient: false };
         let rows = kernel.shape.rows(outputs);
-        let raw = kernel.evaluate(points, view_directions, outputs)?.squeeze(1)?;
+        let raw = kernel.evaluate(points, view_directions, outputs)?.tensor()?.squeeze(1)?;
         let block = |range: Option<std::ops::Range<usize>>| -> Result<Option<Tensor>> {
             range.map(|range| Ok(raw.narrow(1, range.start, range.len())?)).transpose()
         };

@@ -7,7 +7,6 @@ use candle_nn::ops::sigmoid;
 use crate::{
     camera,
     error::{Error, Result},
-    kernels::rays::weighted_ray_sum,
     region::{REGION_COUNT, RegionSet},
     render::{BackgroundEvaluation, Evaluation, RadianceField, RayBundle, norm_over},
 };
@@ -128,7 +127,7 @@ pub fn aggregate<F: RadianceField>(
         Some(activations) => {
             let (batch, count, samples) = weights.weights.dims3()?;
             let share = masks.broadcast_mul(&weights.weights.reshape((batch, 1, count * samples))?)?;
-            let activations = weighted_ray_sum(activations, &share, samples)?;
+            let activations = activations.ray_sum(&share, samples)?;
             let behind = match background.and_then(|background| background.activations.as_ref()) {
                 Some(activations) => Some(activations.broadcast_mul(&remaining)?.unsqueeze(1)?),
                 None => None,

@@ -16,6 +16,7 @@ pub(super) use self::first_samples::FirstSamples;
 use crate::{
     camera,
     error::{Error, Result},
+    kernels::parts::Parts,
     region::RegionSet,
     render::{
         Evaluation, Outputs, Placement, RadianceField, RayBundle, RayOutput, RayWeights, Sampling, frame::background,
@@ -358,7 +359,11 @@ impl Places {
             masks: spread(&lists.masks)?,
             residuals: spread(&lists.residuals)?,
             colours: optional(&lists.colours)?,
-            activations: optional(&lists.activations)?,
+            activations: lists
+                .activations
+                .as_ref()
+                .map(|lists| Ok::<_, Error>(Parts::new(spread(&lists.tensor()?)?)?))
+                .transpose()?,
             gradient: optional(&lists.gradient)?,
         })
     }

@@ -134,7 +134,7 @@ fn features_after_the_sum_equal_the_sum_of_features() {
     let (points, view) = (points(1, 6, DType::F64), Tensor::new(&[0.6, 0.0, 0.8], &Device::Cpu).unwrap());
     let view = view.broadcast_as((1, 6, 3)).unwrap().contiguous().unwrap();
     let evaluation = field.evaluate(&points, Some(&view), ALL).unwrap();
-    let activations = evaluation.activations.unwrap();
+    let activations = evaluation.activations.unwrap().tensor().unwrap();
     let ones = Tensor::ones((1, 9, 6), DType::F64, &Device::Cpu).unwrap();
     // One ray of weight 1 per point, then the folded colour head must agree with the head on the features.
     for region in 0..9 {
