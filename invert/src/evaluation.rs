@@ -103,11 +103,9 @@ pub struct Helpers<'a> {
     pub near: Option<&'a NearStart>,
 }
 
-/// What one inversion gave.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct InversionScore {
-    /// The photo.
-    pub input: String,
+/// What an inversion is measured by; or the means of several, of those that have the number.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Scores {
     /// Wall time, everything included.
     pub seconds: f64,
     /// Of the photo's own view, dB.
@@ -122,14 +120,24 @@ pub struct InversionScore {
     pub novel_view_psnr: Option<f64>,
     /// The same without the background.
     pub novel_view_foreground_psnr: Option<f64>,
-    /// Each of those views.
-    pub novel_views: Vec<NovelView>,
     /// Correlation with the true depth of the head in the photo's view, if the data has it.
     pub depth_correlation: Option<f64>,
     /// Angle between the found and the true direction of view, radians, if the data names it.
     pub pose_error_rad: Option<f64>,
     /// How far tuning moved the depth at other views, world units.
     pub depth_drift: f64,
+}
+
+/// What one inversion gave.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct InversionScore {
+    /// The photo.
+    pub input: String,
+    /// How good it is.
+    #[serde(flatten)]
+    pub scores: Scores,
+    /// Each view that the inverter was not shown.
+    pub novel_views: Vec<NovelView>,
     /// PSNR over the time spent: (seconds, dB), of what each optimiser step compared.
     #[serde(skip)]
     pub curve: Vec<(f64, f64)>,
@@ -186,13 +194,16 @@ pub fn invert_one(
     let metrics = &portrait.metrics;
     let mut score = InversionScore {
         input: person.name.clone(),
-        seconds,
-        psnr: metrics.psnr,
-        ms_ssim: metrics.ms_ssim,
-        lpips: metrics.lpips,
-        depth_drift: metrics.depth_drift,
+        scores: Scores {
+            seconds,
+            psnr: metrics.psnr,
+            ms_ssim: metrics.ms_ssim,
+            lpips: metrics.lpips,
+            depth_drift: metrics.depth_drift,
+            ..Scores::default()
+        },
+        novel_views: Vec::new(),
         curve,
-        ..InversionScore::default()
     };
     measure(&person, &photo, &opened, &mut score)?;
     Ok((score, portrait))
@@ -205,14 +216,14 @@ fn measure(person: &Person, photo: &RgbImage, opened: &Opened, score: &mut Inver
         let mut agreement = Agreement::default();
         let found = LabelMap::from_masks(&picture.masks.squeeze(0)?)?;
         agreement.add(&labels.resized(found.width(), found.height())?, &found)?;
-        score.mask_miou = agreement.mean_iou();
+        score.scores.mask_miou = agreement.mean_iou();
     }
     if let Some(truth) = &person.camera {
-        score.pose_error_rad = Some(angle_between(truth, &camera));
+        score.scores.pose_error_rad = Some(angle_between(truth, &camera));
     }
     if let Some(depth) = &person.depth {
         let surface = Surface::new(camera, &picture.frame)?;
-        score.depth_correlation = depth_correlation(depth, person.labels.as_ref(), &surface, photo.width());
+        score.scores.depth_correlation = depth_correlation(depth, person.labels.as_ref(), &surface, photo.width());
     }
     let Some(truth) = person.camera else { return Ok(()) };
     for other in &person.others {
@@ -233,8 +244,8 @@ fn measure(person: &Person, photo: &RgbImage, opened: &Opened, score: &mut Inver
         };
         score.novel_views.push(NovelView { azimuth_turn_rad, elevation_turn_rad, psnr, foreground_psnr });
     }
-    score.novel_view_psnr = mean(score.novel_views.iter().map(|view| view.psnr));
-    score.novel_view_foreground_psnr = mean(score.novel_views.iter().filter_map(|view| view.foreground_psnr));
+    score.scores.novel_view_psnr = mean(score.novel_views.iter().map(|view| view.psnr));
+    score.scores.novel_view_foreground_psnr = mean(score.novel_views.iter().filter_map(|view| view.foreground_psnr));
     Ok(())
 }
 
@@ -315,22 +326,26 @@ mod tests {
         let score =
             invert_one(&generator, &people, 0, Helpers::default(), &options, &mut |done, all| steps.push((done, all)));
         let (score, portrait) = score.unwrap();
-        assert_eq!((portrait.source.as_str(), portrait.metrics.psnr), (score.input.as_str(), score.psnr));
+        assert_eq!((portrait.source.as_str(), portrait.metrics.psnr), (score.input.as_str(), score.scores.psnr));
         assert_eq!(steps, [(1, 4), (2, 4), (3, 4), (4, 4)]);
         assert_eq!((score.novel_views.len(), score.curve.len()), (2, 4));
         // A known pose is kept, to f32.
-        assert!(score.pose_error_rad.unwrap() < 1e-3, "{score:?}");
-        assert!(score.psnr > 1.0 && score.novel_view_psnr.unwrap() > 1.0 && score.mask_miou.unwrap() > 0.0);
-        assert!(score.depth_correlation.is_some_and(|found| (-1.0..=1.0).contains(&found)), "{score:?}");
+        assert!(score.scores.pose_error_rad.unwrap() < 1e-3, "{score:?}");
+        assert!(
+            score.scores.psnr > 1.0
+                && score.scores.novel_view_psnr.unwrap() > 1.0
+                && score.scores.mask_miou.unwrap() > 0.0
+        );
+        assert!(score.scores.depth_correlation.is_some_and(|found| (-1.0..=1.0).contains(&found)), "{score:?}");
         let pivot = EvaluationOptions { variant: Variant::Pivot, ..options };
         let mut count = 0;
         let (again, _) =
             invert_one(&generator, &people, 0, Helpers::default(), &pivot, &mut |_, _| count += 1).unwrap();
-        assert_eq!((count, again.depth_drift), (3, 0.0));
+        assert_eq!((count, again.scores.depth_drift), (3, 0.0));
 
         let summary = InversionSummary::of(&[score.clone(), again.clone()], 1);
-        assert_eq!((summary.count, summary.failed, summary.lpips), (2, 1, None));
-        assert!((summary.psnr - 0.5 * (score.psnr + again.psnr)).abs() < 1e-12);
+        assert_eq!((summary.count, summary.failed, summary.mean.lpips), (2, 1, None));
+        assert!((summary.mean.psnr - 0.5 * (score.scores.psnr + again.scores.psnr)).abs() < 1e-12);
     }
 
     #[test]

@@ -9,6 +9,8 @@ pub mod edit;
 pub mod error;
 pub mod evaluation;
 pub mod events;
+#[cfg(feature = "onnx")]
+pub mod features;
 mod focus;
 #[cfg(test)]
 mod fuzz;

@@ -16,12 +16,12 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, Result};
 
 #[cfg(feature = "onnx")]
-mod onnx;
+pub(crate) mod onnx;
 
 #[cfg(feature = "onnx")]
 pub use self::onnx::OnnxParser;
 #[cfg(all(test, feature = "onnx"))]
-pub(crate) use self::onnx::tests::identity as identity_network;
+pub(crate) use self::onnx::tests::{identity as identity_network, mean as mean_network};
 
 /// Finds the nine regions in an aligned portrait.
 pub trait RegionParser {

@@ -1,9 +1,9 @@
 //! Feature vectors of whole pictures, by which sets of pictures are compared: the last feature map of an LPIPS
-//! backbone, averaged over the picture.
+//! backbone, averaged over the picture, or whatever else implements [`PictureFeatures`].
 //!
-//! Inception's features, which published FID tables use, are not supported: no package carries its weights. Distances
-//! in these features rank models and settings against each other, and against the floor and the blur reference that
-//! are measured beside them; they are not comparable with published ones.
+//! Distances in LPIPS's features rank models and settings against each other, and against the floor and the blur reference
+//! that are measured beside them; they are not comparable with published ones, which use Inception's: no package carries
+//! its weights, who has them exported to ONNX can use them (`OnnxFeatures` in `cnerf-invert`).
 
 use std::path::Path;
 
@@ -12,7 +12,24 @@ use candle_core::{DType, Device, Tensor};
 use super::perceptual::{Backbone, Perceptual};
 use crate::error::{Error, Result};
 
-/// A picture's feature vector.
+/// A network that sums a picture up in a vector.
+pub trait PictureFeatures {
+    /// The name in reports.
+    fn name(&self) -> &str;
+
+    /// Numbers in a vector.
+    fn length(&self) -> usize;
+
+    /// The vectors of pictures `[B, 3, H, W]` in [-1, 1].
+    fn of(&self, pictures: &Tensor) -> Result<Vec<Vec<f64>>>;
+
+    /// The perceptual distance whose backbone this is, if it is one's.
+    fn perceptual(&self) -> Option<&Perceptual> {
+        None
+    }
+}
+
+/// The last feature map of an LPIPS backbone, averaged over the picture.
 #[derive(Clone, Debug)]
 pub struct PooledFeatures {
     perceptual: Perceptual,
@@ -26,28 +43,27 @@ impl PooledFeatures {
     pub fn load(path: impl AsRef<Path>, device: &Device) -> Result<Self> {
         Ok(Self { perceptual: Perceptual::load(path, device)? })
     }
+}
 
-    /// The name in reports: `lpips-alexnet-relu5` (256 numbers) or `lpips-vgg16-relu5_3` (512).
-    pub fn name(&self) -> &'static str {
+impl PictureFeatures for PooledFeatures {
+    /// `lpips-alexnet-relu5` (256 numbers) or `lpips-vgg16-relu5_3` (512).
+    fn name(&self) -> &str {
         match self.perceptual.backbone() {
             Backbone::AlexNet => "lpips-alexnet-relu5",
             Backbone::Vgg16 => "lpips-vgg16-relu5_3",
         }
     }
 
-    /// Numbers in a vector.
-    pub fn length(&self) -> usize {
+    fn length(&self) -> usize {
         let [.., last] = self.perceptual.backbone().channels();
         last
     }
 
-    /// The distance whose backbone this is.
-    pub fn perceptual(&self) -> &Perceptual {
-        &self.perceptual
+    fn perceptual(&self) -> Option<&Perceptual> {
+        Some(&self.perceptual)
     }
 
-    /// The vectors of pictures `[B, 3, H, W]` in [-1, 1].
-    pub fn of(&self, pictures: &Tensor) -> Result<Vec<Vec<f64>>> {
+    fn of(&self, pictures: &Tensor) -> Result<Vec<Vec<f64>>> {
         let maps = self.perceptual.features(&pictures.detach())?;
         let last = maps.last().ok_or_else(|| Error::shape("feature maps", "five", &[0]))?;
         Ok(last.to_dtype(DType::F64)?.mean((2, 3))?.to_device(&Device::Cpu)?.to_vec2()?)

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::{
     distribution::{FeatureSet, extrapolated_frechet, frechet_distance, kernel_distance, precision_recall},
-    features::PooledFeatures,
+    features::PictureFeatures,
     quality::{self, Agreement},
     spectrum::nyquist_share,
     subject::{Subject, photo_camera, picture_of},
@@ -135,9 +135,9 @@ struct Gathered {
 }
 
 impl Gathered {
-    fn new(features: Option<&PooledFeatures>, resolution: usize) -> Self {
+    fn new(features: Option<&dyn PictureFeatures>, resolution: usize) -> Self {
         Self {
-            features: FeatureSet::new(features.map_or(0, PooledFeatures::length)),
+            features: FeatureSet::new(features.map_or(0, PictureFeatures::length)),
             sharpness: Vec::new(),
             nyquist: Vec::new(),
             masks: vec![0.0; REGION_COUNT * resolution * resolution],
@@ -145,7 +145,7 @@ impl Gathered {
         }
     }
 
-    fn add(&mut self, rgb: &Tensor, features: Option<&PooledFeatures>) -> Result<()> {
+    fn add(&mut self, rgb: &Tensor, features: Option<&dyn PictureFeatures>) -> Result<()> {
         if let Some(features) = features {
             features.of(rgb)?.iter().try_for_each(|vector| self.features.push(vector))?;
         }
@@ -178,7 +178,7 @@ impl Gathered {
 pub fn realism(
     generator: &Generator,
     dataset: &Dataset,
-    features: Option<&PooledFeatures>,
+    features: Option<&dyn PictureFeatures>,
     options: &RealismOptions,
     progress: &mut dyn FnMut(usize),
 ) -> Result<Realism> {
@@ -322,7 +322,7 @@ pub fn reconstruction(
     generator: &Generator,
     portraits: &PortraitCodes,
     dataset: &Dataset,
-    features: Option<&PooledFeatures>,
+    features: Option<&dyn PictureFeatures>,
     options: &RealismOptions,
 ) -> Result<Reconstruction> {
     if !are_codes_of(portraits, dataset) {
@@ -333,6 +333,7 @@ pub fn reconstruction(
     let (device, resolution) = (generator.device(), generator.output_resolution());
     let (mut found, mut agreement, mut distance) = (Reconstruction::default(), Agreement::default(), 0.0);
     let mut masked = false;
+    let perceptual = features.and_then(PictureFeatures::perceptual);
     for index in chosen(dataset, options) {
         let Item { image, mask, camera } = dataset.item(index)?;
         let row = people.row(Draw { index, mirrored: false }) as u32;
@@ -344,8 +345,8 @@ pub fn reconstruction(
         found.count += 1;
         found.psnr += psnr(&shown.rgb, resolution)?;
         found.render_psnr += psnr(&shown.frame.colour, generator.render_resolution())?;
-        if let Some(features) = features {
-            let lpips = features.perceptual().distance(&shown.rgb, &at(&image, resolution, &device)?)?;
+        if let Some(perceptual) = perceptual {
+            let lpips = perceptual.distance(&shown.rgb, &at(&image, resolution, &device)?)?;
             distance += lpips.to_vec1::<f32>()?.first().copied().map_or(0.0, f64::from);
         }
         if let Some(mask) = mask {
@@ -359,7 +360,7 @@ pub fn reconstruction(
         psnr: found.psnr / count,
         render_psnr: found.render_psnr / count,
         mask_miou: if masked { agreement.mean_iou() } else { None },
-        lpips: features.map(|_| distance / count),
+        lpips: perceptual.map(|_| distance / count),
         ..found
     })
 }

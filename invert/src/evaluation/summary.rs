@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{InversionScore, NovelView};
+use super::{InversionScore, NovelView, Scores};
 
 /// Novel views are gathered by how far they are turned, this many bins a radian.
 const BINS_PER_RAD: f64 = 10.0;
@@ -51,37 +51,18 @@ pub struct InversionSummary {
     pub count: usize,
     /// Photos that could not be.
     pub failed: usize,
-    /// See [`InversionScore`], and so below.
-    pub seconds: f64,
-    /// dB.
-    pub psnr: f64,
-    /// 0 to 1.
-    pub ms_ssim: f64,
-    /// If weights were given.
-    pub lpips: Option<f64>,
-    /// If the data has masks.
-    pub mask_miou: Option<f64>,
-    /// dB, if the data has other views.
-    pub novel_view_psnr: Option<f64>,
-    /// dB, without the background.
-    pub novel_view_foreground_psnr: Option<f64>,
-    /// The same by how far the views are turned.
+    /// Of what was inverted.
+    #[serde(flatten)]
+    pub mean: Scores,
+    /// PSNR of novel views by how far they are turned.
     pub novel_views_by_turn: Vec<TurnSummary>,
-    /// If the data has depth.
-    pub depth_correlation: Option<f64>,
-    /// Radians, if the data has cameras.
-    pub pose_error_rad: Option<f64>,
-    /// World units.
-    pub depth_drift: f64,
 }
 
 impl InversionSummary {
     /// The means of `scores`; what a photo lacks is left out of the mean.
     pub fn of(scores: &[InversionScore], failed: usize) -> Self {
-        let of = |value: fn(&InversionScore) -> Option<f64>| mean(scores.iter().filter_map(value));
-        Self {
-            count: scores.len(),
-            failed,
+        let of = |value: fn(&Scores) -> Option<f64>| mean(scores.iter().filter_map(|score| value(&score.scores)));
+        let mean = Scores {
             seconds: of(|score| Some(score.seconds)).unwrap_or_default(),
             psnr: of(|score| Some(score.psnr)).unwrap_or_default(),
             ms_ssim: of(|score| Some(score.ms_ssim)).unwrap_or_default(),
@@ -89,11 +70,12 @@ impl InversionSummary {
             mask_miou: of(|score| score.mask_miou),
             novel_view_psnr: of(|score| score.novel_view_psnr),
             novel_view_foreground_psnr: of(|score| score.novel_view_foreground_psnr),
-            novel_views_by_turn: TurnSummary::of(scores.iter().flat_map(|score| &score.novel_views)),
             depth_correlation: of(|score| score.depth_correlation),
             pose_error_rad: of(|score| score.pose_error_rad),
             depth_drift: of(|score| Some(score.depth_drift)).unwrap_or_default(),
-        }
+        };
+        let novel_views_by_turn = TurnSummary::of(scores.iter().flat_map(|score| &score.novel_views));
+        Self { count: scores.len(), failed, mean, novel_views_by_turn }
     }
 }
 

@@ -23,17 +23,19 @@ use super::{Parsed, PixelScale, RegionParser};
 use crate::error::{Error, Result};
 
 /// Largest ONNX file read, bytes.
-const LARGEST_FILE: u64 = 512 << 20;
+pub(crate) const LARGEST_FILE: u64 = 512 << 20;
 /// Most nodes a graph may have.
 const MOST_NODES: usize = 20_000;
 /// Most values any tensor inside the network may have: 4 GiB of f32 is more than a parser needs by far.
 const MOST_VALUES: usize = 1 << 28;
+/// What a network is to be used as, for messages.
+const PURPOSE: &str = "face parser";
 /// Width and height of the network's input, pixels.
 const SIDES: std::ops::RangeInclusive<usize> = 8..=2048;
 /// Operators whose work or output has no bound that the graph tells.
 const UNBOUNDED: [&str; 4] = ["Loop", "Scan", "If", "Range"];
 
-type Network = Arc<TypedRunnableModel>;
+pub(crate) type Network = Arc<TypedRunnableModel>;
 
 /// A face parser.
 pub struct OnnxParser {
@@ -47,10 +49,29 @@ pub struct OnnxParser {
 
 /// What the network takes: `[1, 3, height, width]`, or `[1, height, width, 3]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Input {
-    width: usize,
-    height: usize,
+pub(crate) struct Input {
+    pub width: usize,
+    pub height: usize,
     channels_last: bool,
+}
+
+impl Input {
+    /// A picture of this size as the network wants it.
+    pub(crate) fn tensor(self, picture: &RgbImage, scale: PixelScale) -> TractResult<Tensor> {
+        let Self { width, height, channels_last } = self;
+        let value =
+            |channel: usize, x: usize, y: usize| scale.apply(channel, picture.get_pixel(x as u32, y as u32).0[channel]);
+        let mut values = Vec::with_capacity(3 * width * height);
+        if channels_last {
+            (0..height)
+                .for_each(|y| (0..width).for_each(|x| values.extend((0..3).map(|channel| value(channel, x, y)))));
+            Tensor::from_shape(&[1, height, width, 3], &values)
+        } else {
+            (0..3)
+                .for_each(|channel| (0..height).for_each(|y| values.extend((0..width).map(|x| value(channel, x, y)))));
+            Tensor::from_shape(&[1, 3, height, width], &values)
+        }
+    }
 }
 
 /// What the network gives, at its own width and height.
@@ -71,8 +92,8 @@ impl OnnxParser {
     pub fn load(path: &Path, scheme: LabelScheme, scale: PixelScale) -> Result<Self> {
         let bytes = picture::read_file(path, LARGEST_FILE)?;
         let refuse = |reason: String| Error::malformed(path, reason);
-        let (network, input) = contained(|| network(&bytes)).map_err(refuse)?;
-        let fact = contained(|| network.model().output_fact(0).cloned().map_err(one_line)).map_err(refuse)?;
+        let (network, input) = contained(PURPOSE, || network(&bytes, PURPOSE)).map_err(refuse)?;
+        let fact = contained(PURPOSE, || network.model().output_fact(0).cloned().map_err(one_line)).map_err(refuse)?;
         let shape = fact.shape.as_concrete().map(<[usize]>::to_vec);
         let shape =
             shape.ok_or_else(|| refuse("the size of its output is not fixed; export it with fixed sizes".into()))?;
@@ -89,23 +110,6 @@ impl OnnxParser {
         let mut boxed = RgbImage::from_pixel(width as u32, height as u32, image::Rgb([128; 3]));
         image::imageops::replace(&mut boxed, &scaled, left as i64, top as i64);
         Ok((boxed, [left, top, side]))
-    }
-
-    fn input_tensor(&self, picture: &RgbImage) -> TractResult<Tensor> {
-        let Input { width, height, channels_last } = self.input;
-        let value = |channel: usize, x: usize, y: usize| {
-            self.scale.apply(channel, picture.get_pixel(x as u32, y as u32).0[channel])
-        };
-        let mut values = Vec::with_capacity(3 * width * height);
-        if channels_last {
-            (0..height)
-                .for_each(|y| (0..width).for_each(|x| values.extend((0..3).map(|channel| value(channel, x, y)))));
-            Tensor::from_shape(&[1, height, width, 3], &values)
-        } else {
-            (0..3)
-                .for_each(|channel| (0..height).for_each(|y| values.extend((0..width).map(|x| value(channel, x, y)))));
-            Tensor::from_shape(&[1, 3, height, width], &values)
-        }
     }
 
     /// The network's label at every pixel of its output, in row order.
@@ -147,8 +151,8 @@ impl RegionParser for OnnxParser {
     fn parse(&self, portrait: &RgbImage) -> Result<Parsed> {
         let refuse = |reason: String| Error::malformed(&self.path, reason);
         let (boxed, [left, top, side]) = self.letterboxed(portrait)?;
-        let labels = contained(|| {
-            let input = self.input_tensor(&boxed).map_err(one_line)?;
+        let labels = contained(PURPOSE, || {
+            let input = self.input.tensor(&boxed, self.scale).map_err(one_line)?;
             let outputs = self.network.run(tvec!(input.into())).map_err(one_line)?;
             let output = outputs.first().ok_or("gives no output; give another parser")?;
             self.labels(output)
@@ -220,21 +224,22 @@ impl Output {
 }
 
 /// Reads and prepares a network of one picture in, and says how it wants the picture.
-fn network(bytes: &[u8]) -> std::result::Result<(Network, Input), String> {
+pub(crate) fn network(bytes: &[u8], purpose: &str) -> std::result::Result<(Network, Input), String> {
     let onnx = onnx();
     let proto = onnx
         .proto_model_for_read(&mut Cursor::new(bytes))
-        .map_err(|error| format!("is no ONNX file ({}); give a face parser exported to ONNX", one_line(error)))?;
-    let graph = proto.graph.as_ref().ok_or("holds no network; give a face parser exported to ONNX")?;
-    check_operators(graph)?;
-    let unusable = |error: TractError| format!("cannot be run as a face parser ({})", one_line(error));
+        .map_err(|error| format!("is no ONNX file ({}); give a {purpose} exported to ONNX", one_line(error)))?;
+    let graph = proto.graph.as_ref();
+    let graph = graph.ok_or_else(|| format!("holds no network; give a {purpose} exported to ONNX"))?;
+    check_operators(graph, purpose)?;
+    let unusable = |error: TractError| format!("cannot be run as a {purpose} ({})", one_line(error));
     let mut model = onnx.model_for_proto_model(&proto).map_err(unusable)?;
     if model.inputs.len() != 1 {
-        return Err(format!("takes {} inputs; a face parser takes one picture", model.inputs.len()));
+        return Err(format!("takes {} inputs; a {purpose} takes one picture", model.inputs.len()));
     }
     let fact = model.input_fact(0).map_err(unusable)?.clone();
     if fact.datum_type.concretize().is_some_and(|datum| datum != f32::datum_type()) {
-        return Err(format!("takes {:?}; a face parser takes pictures of f32", fact.datum_type));
+        return Err(format!("takes {:?}; a {purpose} takes pictures of f32", fact.datum_type));
     }
     // The batch may be open: one picture at a time is given. Sizes may not: nobody says which are meant.
     let sizes: Vec<Option<usize>> =
@@ -247,7 +252,7 @@ fn network(bytes: &[u8]) -> std::result::Result<(Network, Input), String> {
                 sizes.iter().map(|size| size.map_or_else(|| "?".into(), |size| size.to_string())).collect();
             let shape = shape.join(", ");
             return Err(format!(
-                "takes [{shape}]; a face parser takes one picture [1, 3, H, W] or [1, H, W, 3] of fixed size"
+                "takes [{shape}]; a {purpose} takes one picture [1, 3, H, W] or [1, H, W, 3] of fixed size"
             ));
         }
     };
@@ -275,18 +280,21 @@ fn network(bytes: &[u8]) -> std::result::Result<(Network, Input), String> {
 }
 
 /// Refuses graphs that are too large and operators that may run for ever, in subgraphs too.
-fn check_operators(graph: &GraphProto) -> std::result::Result<(), String> {
+fn check_operators(graph: &GraphProto, purpose: &str) -> std::result::Result<(), String> {
     if graph.node.len() > MOST_NODES {
-        return Err(format!("has {} nodes; a face parser has fewer than {MOST_NODES}", graph.node.len()));
+        return Err(format!("has {} nodes; a {purpose} has fewer than {MOST_NODES}", graph.node.len()));
     }
     match graph.node.iter().find(|node| UNBOUNDED.contains(&node.op_type.as_str())) {
-        Some(node) => Err(format!("uses the operator `{}`, which no face parser needs", node.op_type)),
+        Some(node) => Err(format!("uses the operator `{}`, which no {purpose} needs", node.op_type)),
         None => Ok(()),
     }
 }
 
 /// Runs `work`; a panic in it is an error and prints nothing. The ONNX library trusts its files more than is good.
-fn contained<T>(work: impl FnOnce() -> std::result::Result<T, String>) -> std::result::Result<T, String> {
+pub(crate) fn contained<T>(
+    purpose: &str,
+    work: impl FnOnce() -> std::result::Result<T, String>,
+) -> std::result::Result<T, String> {
     // One at a time: the panic hook belongs to the process.
     static HOOK: Mutex<()> = Mutex::new(());
     let _guard = HOOK.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -294,11 +302,11 @@ fn contained<T>(work: impl FnOnce() -> std::result::Result<T, String>) -> std::r
     panic::set_hook(Box::new(|_| {}));
     let outcome = panic::catch_unwind(AssertUnwindSafe(work));
     panic::set_hook(hook);
-    outcome.unwrap_or_else(|_| Err("is damaged or not a face parser; give another file".into()))
+    outcome.unwrap_or_else(|_| Err(format!("is damaged or not a {purpose}; give another file")))
 }
 
 /// An error of the ONNX library and its causes, shortened to part of a line.
-fn one_line(error: impl Into<TractError>) -> String {
+pub(crate) fn one_line(error: impl Into<TractError>) -> String {
     let text = format!("{:#}", error.into());
     let line = text.split_whitespace().collect::<Vec<_>>().join(" ");
     match line.char_indices().nth(160) {

@@ -10,7 +10,7 @@ use cnerf_core::{
 };
 use cnerf_invert::{
     config::{Effort, InvertConfig},
-    evaluation::{EvaluationOptions, Helpers, InversionScore, InversionSummary, People, Variant, invert_one},
+    evaluation::{EvaluationOptions, Helpers, InversionScore, InversionSummary, People, Scores, Variant, invert_one},
     likeness::Likeness,
     parser::ParserConfig,
 };
@@ -181,7 +181,8 @@ impl InversionArguments {
             series(&|one| mean_curve(&one.portraits), Mark::Line),
         )?;
         if let Some(path) = self.plots.path("psnr") {
-            let values = variants.iter().map(|one| (name(one), one.portraits.iter().map(|score| score.psnr).collect()));
+            let values =
+                variants.iter().map(|one| (name(one), one.portraits.iter().map(|score| score.scores.psnr).collect()));
             histogram("Inverted photos", Axis::linear("PSNR, dB"), &values.collect::<Vec<_>>()).save(path)?;
         }
         let by_turn = |one: &Measured| {
@@ -247,12 +248,12 @@ fn portrait_path(folder: &Path, people: &People, index: usize) -> PathBuf {
 }
 
 /// For each variant a line over efforts: mean time, and what `value` takes of the means.
-fn over_effort(rows: &[Measured], suffix: &str, value: fn(&InversionSummary) -> Option<f64>) -> Vec<Series> {
+fn over_effort(rows: &[Measured], suffix: &str, value: fn(&Scores) -> Option<f64>) -> Vec<Series> {
     let mut lines: Vec<Series> = Vec::new();
     for row in rows {
-        let Some(value) = value(&row.summary) else { continue };
+        let Some(value) = value(&row.summary.mean) else { continue };
         let name = format!("{}{suffix}", row.variant.name());
-        let point = (row.summary.seconds, value);
+        let point = (row.summary.mean.seconds, value);
         match lines.iter_mut().find(|line| line.name == name) {
             Some(line) => line.points.push(point),
             None => lines.push(Series { name, points: vec![point], mark: Mark::LineAndDots }),
@@ -287,15 +288,19 @@ fn table(rows: &[Measured]) -> String {
         let mut cells = vec![
             found.count.to_string(),
             found.failed.to_string(),
-            shown(found.seconds, 1),
-            shown(found.psnr, 2),
-            shown(found.ms_ssim, 3),
-            shown(found.lpips, 3),
-            shown(found.mask_miou, 3),
-            shown(found.novel_view_psnr, 2),
+            shown(found.mean.seconds, 1),
+            shown(found.mean.psnr, 2),
+            shown(found.mean.ms_ssim, 3),
+            shown(found.mean.lpips, 3),
+            shown(found.mean.mask_miou, 3),
+            shown(found.mean.novel_view_psnr, 2),
         ];
         cells.extend(TURNS_SHOWN_RAD.map(|turn| shown(found.turned(turn).map(|turned| turned.psnr), 2)));
-        cells.extend([shown(found.depth_correlation, 3), shown(found.pose_error_rad, 3), shown(found.depth_drift, 5)]);
+        cells.extend([
+            shown(found.mean.depth_correlation, 3),
+            shown(found.mean.pose_error_rad, 3),
+            shown(found.mean.depth_drift, 5),
+        ]);
         line(row.effort.name(), row.variant.name(), cells)
     }));
     lines.join("\n")

@@ -6,7 +6,7 @@ use clap::Args;
 use cnerf_core::{
     data::dataset::Dataset,
     eval::{
-        features::PooledFeatures,
+        features::{PictureFeatures, PooledFeatures},
         realism::{self, Realism, RealismOptions, Reconstruction},
     },
     interop::chart::{Axis, BarChart, histogram},
@@ -16,6 +16,7 @@ use cnerf_core::{
 use cnerf_invert::{
     config::{Effort, InvertConfig},
     evaluation::{EvaluationOptions, Helpers, InversionSummary, People, Variant, invert_one},
+    parser::PixelScale,
 };
 use serde::Serialize;
 
@@ -39,10 +40,14 @@ pub struct QualityArguments {
     /// Truncation of the random portraits: 1 draws from all, 0 gives the mean portrait
     #[arg(long, default_value_t = 1.0, value_name = "PSI", value_parser = truncation, allow_negative_numbers = true)]
     trunc: f64,
-    /// LPIPS weights (AlexNet or VGG16, safetensors) whose features FID and KID are computed in; without them only
-    /// sharpness and regions are compared. Not comparable with Inception-FID; Inception weights are not supported
+    /// Network whose features FID and KID are computed in: LPIPS weights (AlexNet or VGG16, safetensors), not comparable
+    /// with Inception-FID; or any network in ONNX format that gives one vector a picture, e.g. Inception's. Without it only
+    /// sharpness and regions are compared
     #[arg(long, value_name = "FILE")]
     features: Option<PathBuf>,
+    /// What an ONNX network wants its colours as
+    #[arg(long, value_enum, default_value = "symmetric", requires = "features")]
+    features_input: PixelScale,
     /// Portraits to reconstruct for `mask_miou`: from the codes beside the model if it was trained on this data, else
     /// by fitting codes to photo and mask at the given camera
     #[arg(long, default_value_t = 4, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=100_000))]
@@ -75,8 +80,8 @@ impl QualityArguments {
         self.plots.check(&CHARTS)?;
         let generator = self.model.load_or("portrait")?;
         let dataset = Dataset::open(&self.data)?;
-        let features =
-            self.features.as_ref().map(|path| PooledFeatures::load(path, &generator.device())).transpose()?;
+        let features = self.features.as_ref().map(|path| self.load(path, &generator)).transpose()?;
+        let features = features.as_deref();
         let options = RealismOptions { count: self.count as usize, truncation: self.trunc, seed };
         let model = model_name(&self.model).to_owned();
         let (count, side) = (self.count, generator.output_resolution());
@@ -84,14 +89,14 @@ impl QualityArguments {
             "{count} random portraits of `{model}` (truncation {}) against {}, at {side} pixels, {}",
             self.trunc,
             self.data.display(),
-            features.as_ref().map_or("without --features: no FID, no KID", PooledFeatures::name),
+            features.map_or("without --features: no FID, no KID", PictureFeatures::name),
         ));
         let bar = console.bar(realism::steps(&dataset, &options) as u64, "quality");
-        let realism = realism::realism(&generator, &dataset, features.as_ref(), &options, &mut |done| {
+        let realism = realism::realism(&generator, &dataset, features, &options, &mut |done| {
             bar.set_position(done as u64);
         })?;
         bar.finish_and_clear();
-        let (reconstruction, mask_miou) = self.reconstruct(&generator, &dataset, features.as_ref(), seed, console)?;
+        let (reconstruction, mask_miou) = self.reconstruct(&generator, &dataset, features, seed, console)?;
         let mask_miou_from = mask_miou.map(|_| match reconstruction {
             Some(_) => "portraits from their training codes",
             None => "codes fitted to held-out photos and masks",
@@ -104,12 +109,23 @@ impl QualityArguments {
         Ok(Outcome::Done)
     }
 
+    /// The network at `path`.
+    fn load(&self, path: &Path, generator: &Generator) -> anyhow::Result<Box<dyn PictureFeatures>> {
+        if path.extension().is_none_or(|extension| extension != "onnx") {
+            return Ok(Box::new(PooledFeatures::load(path, &generator.device())?));
+        }
+        #[cfg(feature = "onnx")]
+        return Ok(Box::new(cnerf_invert::features::OnnxFeatures::load(path, self.features_input)?));
+        #[cfg(not(feature = "onnx"))]
+        anyhow::bail!("--features: {}: this build reads no ONNX files; build with `--features onnx`", path.display())
+    }
+
     /// Regions of portraits whose photos are known, and how well they show those if the model was trained on them.
     fn reconstruct(
         &self,
         generator: &Generator,
         dataset: &Dataset,
-        features: Option<&PooledFeatures>,
+        features: Option<&dyn PictureFeatures>,
         seed: u64,
         console: &Console,
     ) -> anyhow::Result<(Option<Reconstruction>, Option<f64>)> {
@@ -145,7 +161,7 @@ impl QualityArguments {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        Ok((None, InversionSummary::of(&scores, 0).mask_miou))
+        Ok((None, InversionSummary::of(&scores, 0).mean.mask_miou))
     }
 
     fn draw(&self, found: &Realism) -> anyhow::Result<()> {

@@ -24,7 +24,7 @@ use cnerf_core::{
         dataset::{Dataset, DatasetWriter, EncodedItem, PhotoFormat},
         labels::LabelMap,
     },
-    eval::features::PooledFeatures,
+    eval::features::{PictureFeatures, PooledFeatures},
     train::{
         config::{Stage, TrainConfig},
         field_stage::FieldStage,
@@ -93,6 +93,7 @@ fn main() -> Result<()> {
     let dataset = Arc::new(data(&options)?);
     let device = Device::Cpu;
     let features = options.features.as_ref().map(|path| PooledFeatures::load(path, &device)).transpose()?;
+    let features = features.as_ref().map(|features| features as &dyn PictureFeatures);
     // L_STD compares by the discriminator's features: LPIPS's do not take pictures this small.
     let inputs = Inputs { dataset, perceptual: None, start: None, device, team: Team::default() };
 
@@ -113,7 +114,7 @@ fn main() -> Result<()> {
             Err(error) => return Err(error),
         };
         if wanted {
-            let measured = measure(&trained, &inputs.dataset, features.as_ref(), variant.whole_head, &options)?;
+            let measured = measure(&trained, &inputs.dataset, features, variant.whole_head, &options)?;
             let field_weights = trained.generator.parameters().within("field").count();
             rows.push(Row { field_weights, seconds, measured, ..Row::new(variant) });
             report(&options, &rows)?;

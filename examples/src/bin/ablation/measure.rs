@@ -6,7 +6,7 @@ use cnerf_core::{
     data::dataset::Dataset,
     eval::{
         consistency::Consistency,
-        features::PooledFeatures,
+        features::PictureFeatures,
         locality::EditChange,
         realism::{RealismOptions, camera_like, realism, reconstruction},
         separation::{self, Separation},
@@ -56,7 +56,7 @@ pub struct Measured {
 pub fn measure(
     trained: &Start,
     dataset: &Dataset,
-    features: Option<&PooledFeatures>,
+    features: Option<&dyn PictureFeatures>,
     whole_head: bool,
     options: &Options,
 ) -> Result<Measured> {

@@ -63,6 +63,17 @@ pub(crate) fn identity(input: &[u64], labels: bool) -> Vec<u8> {
     [number(1, 8), bytes(7, &graph), bytes(8, &[bytes(1, b""), number(2, 13)].concat())].concat()
 }
 
+/// A network of one pooling: the mean of each channel, `[1, 3, 1, 1]`.
+pub(crate) fn mean(input: &[u64]) -> Vec<u8> {
+    let graph = [
+        bytes(1, &node("GlobalAveragePool", &["x"], "mean", &[])),
+        bytes(2, b"features"),
+        bytes(11, &value_info("x", 1, input)),
+        bytes(12, &value_info("mean", 1, &[1, 3, 1, 1])),
+    ];
+    [number(1, 8), bytes(7, &graph.concat()), bytes(8, &[bytes(1, b""), number(2, 13)].concat())].concat()
+}
+
 fn load(file: &[u8], classes: &[&str]) -> Result<OnnxParser> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("parser.onnx");
