@@ -79,7 +79,8 @@ impl Warmup {
         resolutions.dedup();
         let portraits = Cached::new(&inputs.dataset, &resolutions, &|_| ())?;
         let generator = match start {
-            Some(start) => start.generator.with_upsampler(None, 0)?.with_population(None)?,
+            // Its upsampler comes along unmoved, for the stage that goes on with it.
+            Some(start) => start.generator.with_population(None)?,
             None => {
                 let model = crate::config::GeneratorConfig { upsampler: None, population: 0, ..config.model.clone() };
                 Generator::new(&model, &Parameters::fresh(config.seed, DType::F32, &inputs.device))?
@@ -466,6 +467,28 @@ mod tests {
             team: Team::default(),
         };
         Warmup::new(&config, &inputs, None).unwrap()
+    }
+
+    #[test]
+    fn the_upsampler_of_the_start_comes_along_unmoved() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = TrainConfig::preset(Preset::Tiny);
+        let generator = Generator::new(&config.model, &Parameters::fresh(1, DType::F32, &Device::Cpu)).unwrap();
+        let weights = |generator: &Generator| generator.parameters().within("upsampler").snapshot().unwrap();
+        let before = weights(&generator);
+        let start = Start { generator, portrait_codes: None };
+        let (dataset, device, team) = (dataset(folder.path(), 9), Device::Cpu, Team::default());
+        let inputs = Inputs { dataset, perceptual: None, start: None, device, team };
+        let mut stage = Warmup::new(&config, &inputs, Some(&start)).unwrap();
+        stage.step(0).unwrap();
+        let after = stage.finished().unwrap().generator;
+        assert_eq!(after.config().upsampler, config.model.upsampler);
+        let after = weights(&after);
+        assert!(!before.is_empty() && before.len() == after.len());
+        for (name, weight) in &before {
+            let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            assert_eq!(values(weight), values(&after[name]), "{name}");
+        }
     }
 
     #[test]
