@@ -207,7 +207,14 @@ fn features_of(
     let chosen =
         Tensor::new(chosen, &Device::Cpu).unwrap().to_dtype(masks.dtype()).unwrap().reshape((1, 9, 1)).unwrap();
     let chosen = chosen.broadcast_as(masks.shape()).unwrap().contiguous().unwrap();
-    let activations = evaluation.activations.as_ref().unwrap().broadcast_mul(&chosen.unsqueeze(2).unwrap()).unwrap();
+    let activations = evaluation
+        .activations
+        .as_ref()
+        .unwrap()
+        .tensor()
+        .unwrap()
+        .broadcast_mul(&chosen.unsqueeze(2).unwrap())
+        .unwrap();
     field.features(&activations, &chosen, Some(view)).unwrap()
 }
 
