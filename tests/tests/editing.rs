@@ -152,13 +152,24 @@ fn a_page_turns_the_head_and_hides_regions() {
     let test = page.replace("<body>", clock).replace("</body>", hands);
     folder.write("test.html", test.as_bytes());
     let profile = format!("--user-data-dir={}", folder.path("browser").display());
-    let output = Command::new(browser)
+    let output = Command::new(&browser)
         .args(["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", &profile])
         .args(["--window-size=1100,800", "--virtual-time-budget=400000", "--dump-dom"])
         .arg(format!("file://{}", folder.path("test.html").display()))
         .output()
         .unwrap();
+    // What is there as soon as the page has loaded: the head, and nothing missing.
+    let shot = Command::new(&browser)
+        .args(["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", &profile, "--window-size=1100,800"])
+        .arg(format!("--screenshot={}", folder.path("shot.png").display()))
+        .arg(format!("file://{}", folder.path("head.html").display()))
+        .output()
+        .unwrap();
     let _ = fs::remove_dir_all(folder.path("browser"));
+    assert!(shot.status.success(), "{}", String::from_utf8_lossy(&shot.stderr));
+    let shot = folder.picture("shot.png");
+    let stage = imageops::crop_imm(&shot, 100, 250, 400, 300).to_image();
+    assert!(has_content(&stage), "a page that has just loaded shows the head");
     let text = String::from_utf8_lossy(&output.stdout);
     let seen = text
         .rsplit("<pre id=\"seen\">")

@@ -237,6 +237,14 @@ pub struct UpsamplerStageConfig {
     /// Weight of L1 between the backgrounds of random portraits and those of their enlarged renders: no photo tells what is
     /// behind a portrait that nobody took, and a critic alone fills it with patterns. Paper: 0.
     pub calm_background: f64,
+    /// Weight of the mean square of what is added to the enlarged renders of random portraits, outside eyes, eyebrows, nose
+    /// and mouth: photos teach the detail of portraits that were taken, and nothing else keeps the others free of strokes
+    /// and specks. A square, so pores are cheap and strokes are dear. Paper: 0.
+    #[serde(default)]
+    pub calm_detail: f64,
+    /// Share of a random portrait's region codes that come from another random portrait, as an edit does it. Paper: 0.
+    #[serde(default)]
+    pub exchanged_codes: f64,
     /// The second view is turned by up to this, radians; more often by less.
     pub agreement_turn_rad: f64,
     /// Steps a discriminator or critic learns alone before its verdict counts. Paper: 0.
@@ -263,6 +271,13 @@ pub struct UpsamplerStageConfig {
     pub average_half_life_images: f64,
 }
 
+impl UpsamplerStageConfig {
+    /// Whether random portraits teach the generator by themselves, without anybody who judges them.
+    pub fn teaches_random_portraits(&self) -> bool {
+        self.agreement > 0.0 || self.calm_background > 0.0 || self.calm_detail > 0.0
+    }
+}
+
 impl TrainConfig {
     /// Refuses what cannot be trained.
     pub fn validate(&self) -> Result<()> {
@@ -279,6 +294,9 @@ impl TrainConfig {
         positive("upsampler.crop", self.upsampler.crop)?;
         if !(1.0..=4.0).contains(&self.upsampler.perceptual_zoom) {
             return Err(Error::config("upsampler.perceptual_zoom", "must be between 1 and 4"));
+        }
+        if !(0.0..=1.0).contains(&self.upsampler.exchanged_codes) {
+            return Err(Error::config("upsampler.exchanged_codes", "must be between 0 and 1"));
         }
         for (stage, target, images) in [
             ("field", self.field.augment_target, self.field.augment_ramp_images),

@@ -30,6 +30,7 @@ use crate::{
         layers::Resampling,
         upsampler::{Noise, Upsampler, UpsamplerOutput},
     },
+    region::Region,
     render::Frame,
     rng::Stream,
     train::{
@@ -144,8 +145,8 @@ impl UpsamplerStage {
         if adversary.is_some() && pairs.is_none() && stage.random_portraits == 0 {
             return Err(Error::config("upsampler.random_portraits", "must be at least 1 where there are no pairs"));
         }
-        if (stage.agreement > 0.0 || stage.calm_background > 0.0) && stage.random_portraits == 0 {
-            let reason = "and calm_background look at random portraits; set upsampler.random_portraits";
+        if stage.teaches_random_portraits() && stage.random_portraits == 0 {
+            let reason = "and calm_* look at random portraits; set upsampler.random_portraits";
             return Err(Error::config("upsampler.agreement", reason));
         }
         Ok(Self {
@@ -194,8 +195,7 @@ impl UpsamplerStage {
     fn random_pictures(&self, step: usize, metrics: &mut Metrics) -> Result<RandomPictures> {
         let config = &self.config;
         let judged = self.adversary.is_some() || self.critic.is_some();
-        let taught = config.agreement > 0.0 || config.calm_background > 0.0;
-        if config.random_portraits == 0 || !(judged || taught) {
+        if config.random_portraits == 0 || !(judged || config.teaches_random_portraits()) {
             return Ok(RandomPictures::default());
         }
         let mut random = Stream::new(self.seed, &[STREAM, step as u64, 1]);
@@ -215,10 +215,11 @@ impl UpsamplerStage {
             metrics.push_loss("agreement", &loss)?;
             terms.push((loss * config.agreement)?);
         }
-        if config.calm_background > 0.0 {
-            let loss = background_detail(&output, &frame.colour)?;
-            metrics.push_loss("background", &loss)?;
-            terms.push((loss * config.calm_background)?);
+        if config.calm_background > 0.0 || config.calm_detail > 0.0 {
+            let calm = Calm::of(&output, &frame.colour)?;
+            metrics.push_loss("background", &calm.background)?;
+            metrics.push_loss("detail", &calm.detail)?;
+            terms.push(((calm.background * config.calm_background)? + (calm.detail * config.calm_detail)?)?);
         }
         let judged = match factor {
             1 => Judged { image: output.rgb, masks: output.masks },
@@ -300,7 +301,16 @@ impl UpsamplerStage {
         let share = self.team.share();
         let people = share.whole(people);
         let noise = random.normal_tensor(&[people, self.generator.noise_dim()], &self.device)?;
-        let codes = self.generator.codes_of(&noise)?.detach();
+        let mut codes = self.generator.codes_of(&noise)?.detach();
+        if self.config.exchanged_codes > 0.0 {
+            let others = random.normal_tensor(&[people, self.generator.noise_dim()], &self.device)?;
+            let others = self.generator.codes_of(&others)?.detach();
+            let (_, regions, kinds, _) = codes.dims4()?;
+            let count = people * regions * kinds;
+            let exchanged = (0..count).map(|_| u8::from(random.chance(self.config.exchanged_codes as f32)));
+            let exchanged = Tensor::from_iter(exchanged, &self.device)?.reshape((people, regions, kinds, 1))?;
+            codes = exchanged.broadcast_as(codes.shape())?.where_cond(&others, &codes)?;
+        }
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
         let mut cameras = Vec::new();
         for _ in 0..people {
@@ -395,17 +405,39 @@ impl StageRun for UpsamplerStage {
     }
 }
 
-/// Mean absolute difference between pictures and their enlarged renders `[B, 3, r, r]` where they show background.
-fn background_detail(picture: &UpsamplerOutput, render: &Tensor) -> Result<Tensor> {
-    let mut enlarged = render.clone();
-    while enlarged.dim(3)? < picture.rgb.dim(3)? {
-        enlarged = Resampling::BilinearUp.apply(&enlarged)?;
+/// What random pictures add to their enlarged renders where nothing tells what to add.
+struct Calm {
+    /// Mean absolute difference over the background.
+    background: Tensor,
+    /// Mean squared difference over all but [`DETAILED`].
+    detail: Tensor,
+}
+
+/// Regions that live by their detail: eyes, eyebrows, mouth, nose.
+const DETAILED: [Region; 4] = [Region::Eyes, Region::Eyebrows, Region::Mouth, Region::Nose];
+
+impl Calm {
+    /// Of pictures and their renders `[B, 3, r, r]`.
+    fn of(picture: &UpsamplerOutput, render: &Tensor) -> Result<Self> {
+        let mut enlarged = render.clone();
+        while enlarged.dim(3)? < picture.rgb.dim(3)? {
+            enlarged = Resampling::BilinearUp.apply(&enlarged)?;
+        }
+        let added = (&picture.rgb - enlarged)?;
+        let masks = picture.masks.detach();
+        let mask = |region: Region| masks.narrow(1, region as usize, 1);
+        let background = mask(Region::Background)?;
+        let detailed = DETAILED.into_iter().map(mask).reduce(|sum, mask| sum? + mask?);
+        let plain = match detailed {
+            Some(detailed) => (1.0 - detailed?)?,
+            None => background.ones_like()?,
+        };
+        let mean_over = |values: Tensor, area: &Tensor| -> Result<Tensor> {
+            // At least a pixel's worth: a square may show none of it.
+            Ok(values.mean_keepdim(1)?.mul(area)?.sum_all()?.div(&(area.sum_all()? + 1.0)?)?)
+        };
+        Ok(Self { background: mean_over(added.abs()?, &background)?, detail: mean_over(added.sqr()?, &plain)? })
     }
-    let background = picture.masks.narrow(1, 0, 1)?.detach();
-    let off = (&picture.rgb - enlarged)?.abs()?.mean_keepdim(1)?.mul(&background)?;
-    // At least a pixel's worth: a square of nothing but head has no background to be off.
-    let area = (background.sum_all()? + 1.0)?;
-    Ok(off.sum_all()?.div(&area)?)
 }
 
 /// Pictures as a classifier sees them in one view.
@@ -468,7 +500,7 @@ mod tests {
         let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
         let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=1", "random_portraits=2"];
         let criticised = vec!["critic=0.1", "discriminator_ahead_steps=1", "random_portraits=1"];
-        let calm = vec!["random_portraits=1", "calm_background=1"];
+        let calm = vec!["random_portraits=1", "calm_background=1", "calm_detail=1", "exchanged_codes=0.5"];
         let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
         let augmented = vec![
             "adversarial=0.1",
@@ -481,7 +513,7 @@ mod tests {
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
             (alone, &["discriminator", "adversarial"][..]),
             (criticised, &["pixels", "perceptual", "critic", "criticised"][..]),
-            (calm, &["pixels", "background"][..]),
+            (calm, &["pixels", "background", "detail"][..]),
             (agreeing, &["pixels", "discriminator", "adversarial", "agreement"][..]),
             (augmented, &["adversarial", "real_sign", "augment_probability"][..]),
         ] {
