@@ -242,7 +242,8 @@ pub struct UpsamplerStageConfig {
     /// and specks. A square, so pores are cheap and strokes are dear. Paper: 0.
     #[serde(default)]
     pub calm_detail: f64,
-    /// Share of a random portrait's region codes that come from another random portrait, as an edit does it. Paper: 0.
+    /// Share of a random portrait's region codes that come from another one, as an edit does it. Above 0, and where there
+    /// are pairs, half of the random portraits are training portraits seen from elsewhere. Paper: 0.
     #[serde(default)]
     pub exchanged_codes: f64,
     /// The second view is turned by up to this, radians; more often by less.

@@ -296,21 +296,34 @@ impl UpsamplerStage {
         Ok(Some((path.penalty * (config.path_length * every as f64))?))
     }
 
+    /// Codes `[B, 9, 2, D]` of `people` random portraits without a graph: of the population and, where codes are exchanged
+    /// and there are pairs, as often of a training portrait, which its own photo shows from one side alone.
+    fn random_codes(&self, people: usize, random: &mut Stream) -> Result<Tensor> {
+        let share = self.config.exchanged_codes as f32;
+        let mut draw = || -> Result<Tensor> {
+            if let Some(pairs) = self.pairs.as_ref().filter(|_| share > 0.0 && random.chance(0.5)) {
+                let rows: Vec<u32> = (0..people).map(|_| random.below(pairs.codes().count()) as u32).collect();
+                return Ok(pairs.codes().codes(&self.generator, &rows)?.detach());
+            }
+            let noise = random.normal_tensor(&[people, self.generator.noise_dim()], &self.device)?;
+            Ok(self.generator.codes_of(&noise)?.detach())
+        };
+        let codes = draw()?;
+        if share == 0.0 {
+            return Ok(codes);
+        }
+        let others = draw()?;
+        let (_, regions, kinds, _) = codes.dims4()?;
+        let exchanged = (0..people * regions * kinds).map(|_| u8::from(random.chance(share)));
+        let exchanged = Tensor::from_iter(exchanged, &self.device)?.reshape((people, regions, kinds, 1))?;
+        Ok(exchanged.broadcast_as(codes.shape())?.where_cond(&others, &codes)?)
+    }
+
     /// Renders of `people` random portraits from `views` random cameras each; the field gets no gradient.
     fn random_renders(&self, people: usize, views: usize, random: &mut Stream) -> Result<RandomRenders> {
         let share = self.team.share();
         let people = share.whole(people);
-        let noise = random.normal_tensor(&[people, self.generator.noise_dim()], &self.device)?;
-        let mut codes = self.generator.codes_of(&noise)?.detach();
-        if self.config.exchanged_codes > 0.0 {
-            let others = random.normal_tensor(&[people, self.generator.noise_dim()], &self.device)?;
-            let others = self.generator.codes_of(&others)?.detach();
-            let (_, regions, kinds, _) = codes.dims4()?;
-            let count = people * regions * kinds;
-            let exchanged = (0..count).map(|_| u8::from(random.chance(self.config.exchanged_codes as f32)));
-            let exchanged = Tensor::from_iter(exchanged, &self.device)?.reshape((people, regions, kinds, 1))?;
-            codes = exchanged.broadcast_as(codes.shape())?.where_cond(&others, &codes)?;
-        }
+        let codes = self.random_codes(people, random)?;
         let [azimuth, elevation] = self.generator.config().camera_deviation_rad;
         let mut cameras = Vec::new();
         for _ in 0..people {
