@@ -237,9 +237,9 @@ pub struct UpsamplerStageConfig {
     /// Weight of L1 between the backgrounds of random portraits and those of their enlarged renders: no photo tells what is
     /// behind a portrait that nobody took, and a critic alone fills it with patterns. Paper: 0.
     pub calm_background: f64,
-    /// Weight of the mean square of what is added to the enlarged renders of random portraits, outside eyes, eyebrows, nose
-    /// and mouth: photos teach the detail of portraits that were taken, and nothing else keeps the others free of strokes
-    /// and specks. A square, so pores are cheap and strokes are dear. Paper: 0.
+    /// Weight of the mean squared Laplacian of what is added to the enlarged renders of random portraits, outside eyes,
+    /// eyebrows, nose and mouth: photos teach the detail of portraits that were taken, and nothing else keeps the others
+    /// free of specks. Paper: 0.
     #[serde(default)]
     pub calm_detail: f64,
     /// Share of a random portrait's region codes that come from another one, as an edit does it. Above 0, and where there
