@@ -66,6 +66,8 @@ fn quality_with_features_has_a_floor_and_a_blur_reference() {
     let refused = folder.run(&format!("{line} --features other.safetensors"));
     assert!(refused.code == 2 && refused.stderr.contains("other.safetensors"), "{}", refused.stderr);
     assert_eq!(refused.stderr.lines().filter(|line| line.starts_with("error")).count(), 1);
+    let refused = folder.run(&format!("{line} --features {} --features-input unit", weights.display()));
+    assert!(refused.code == 2 && refused.stderr.contains("--features-input"), "{}", refused.stderr);
 }
 
 #[test]

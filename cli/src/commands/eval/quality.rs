@@ -45,9 +45,9 @@ pub struct QualityArguments {
     /// sharpness and regions are compared
     #[arg(long, value_name = "FILE")]
     features: Option<PathBuf>,
-    /// What an ONNX network wants its colours as
-    #[arg(long, value_enum, default_value = "symmetric", requires = "features")]
-    features_input: PixelScale,
+    /// What an ONNX network wants its colours as [default: symmetric]
+    #[arg(long, value_enum, requires = "features")]
+    features_input: Option<PixelScale>,
     /// Portraits to reconstruct for `mask_miou`: from the codes beside the model if it was trained on this data, else
     /// by fitting codes to photo and mask at the given camera
     #[arg(long, default_value_t = 4, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=100_000))]
@@ -112,10 +112,18 @@ impl QualityArguments {
     /// The network at `path`.
     fn load(&self, path: &Path, generator: &Generator) -> anyhow::Result<Box<dyn PictureFeatures>> {
         if path.extension().is_none_or(|extension| extension != "onnx") {
+            let name = path.display();
+            anyhow::ensure!(
+                self.features_input.is_none(),
+                "--features-input is for ONNX networks, and {name} is none; leave it out"
+            );
             return Ok(Box::new(PooledFeatures::load(path, &generator.device())?));
         }
         #[cfg(feature = "onnx")]
-        return Ok(Box::new(cnerf_invert::features::OnnxFeatures::load(path, self.features_input)?));
+        return Ok(Box::new(cnerf_invert::features::OnnxFeatures::load(
+            path,
+            self.features_input.unwrap_or_default(),
+        )?));
         #[cfg(not(feature = "onnx"))]
         anyhow::bail!("--features: {}: this build reads no ONNX files; build with `--features onnx`", path.display())
     }
