@@ -89,7 +89,7 @@ impl TrainConfig {
                 random_portraits: 1,
                 agreement: 1.0,
                 calm_background: 1.0,
-                calm_detail: 4.0,
+                calm_detail: 25.0,
                 exchanged_codes: 0.2,
                 agreement_turn_rad: 0.5,
                 discriminator_ahead_steps: 200,
