@@ -221,6 +221,7 @@ impl TrainConfig {
                 agreement: 0.0,
                 calm_background: 0.0,
                 calm_detail: 0.0,
+                exchanged_codes: 0.0,
                 random_portraits: 2,
                 ..small.upsampler
             },

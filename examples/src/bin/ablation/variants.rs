@@ -121,8 +121,8 @@ fn ours(options: &Options) -> TrainConfig {
     (field.generator_learning_rate, field.average_half_life_images) = (3e-4, 40.0);
     let upsampler = &mut config.upsampler;
     (upsampler.steps, upsampler.batch, upsampler.crop) = (options.upsampler_steps, 4, half);
-    (upsampler.perceptual, upsampler.agreement, upsampler.calm_background, upsampler.random_portraits) =
-        (0.0, 0.0, 0.0, 0);
+    (upsampler.perceptual, upsampler.agreement, upsampler.random_portraits) = (0.0, 0.0, 0);
+    (upsampler.calm_background, upsampler.calm_detail, upsampler.exchanged_codes) = (0.0, 0.0, 0.0);
     upsampler.average_half_life_images = 100.0;
     config
 }
