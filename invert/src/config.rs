@@ -83,7 +83,7 @@ impl InvertConfig {
     /// The phases' lengths. Explicit step counts keep the effort's proportions between the pivot's phases.
     pub fn steps(&self) -> Steps {
         let of_effort = match self.effort {
-            Effort::Fast => Steps { shared: 28, free: 56, whole: 5, tune: 7, rays: 512 },
+            Effort::Fast => Steps { shared: 22, free: 40, whole: 5, tune: 7, rays: 512 },
             Effort::Balanced => Steps { shared: 60, free: 160, whole: 24, tune: 36, rays: 1024 },
             Effort::Best => Steps { shared: 120, free: 500, whole: 100, tune: 150, rays: 2048 },
         };
