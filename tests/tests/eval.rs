@@ -93,6 +93,25 @@ fn consistency_measures_random_portraits_and_portrait_files() {
 }
 
 #[test]
+fn consistency_of_drawn_heads_stands_beside_the_models() {
+    let folder = Folder::with_model("reference");
+    folder.run("synth --count 2 --size 64 --with depth --turns=-0.3,0.3,-0.05,0.05 --out views").done();
+    let report = folder.json(&format!("eval consistency --model {MODEL} --count 1 --reference views"));
+    let reference = &report["reference"];
+    assert_eq!(number(reference, "count"), 2.0);
+    // Drawings seen from other sides by their exact depth: edges thinner than pixels differ, nothing else does.
+    assert!((18.0..40.0).contains(&number(reference, "reprojection_psnr")), "{reference}");
+    assert!(number(&reference["detail"][0], "correlation") > 0.8, "{reference}");
+    assert_eq!(reference["detail"][1]["correlation"], Value::Null, "no view is turned by 0.4 rad");
+    let shown = folder.run(&format!("eval consistency --model {MODEL} --count 1 --reference views")).done();
+    assert!(shown.stdout.contains("heads of the reference"), "{}", shown.stdout);
+
+    folder.run("synth --count 1 --size 32 --out flat").done();
+    let refused = folder.run(&format!("eval consistency --model {MODEL} --count 1 --reference flat"));
+    assert!(refused.code == 2 && refused.stderr.contains("flat: no head with depth"), "{}", refused.stderr);
+}
+
+#[test]
 fn locality_measures_every_region_and_texture_moves_nothing() {
     let folder = Folder::with_model("locality");
     let report = folder.json(&format!("eval locality --model {MODEL} --count 2 --plots charts"));

@@ -12,6 +12,7 @@ use std::{
     sync::atomic::{AtomicUsize, Ordering},
 };
 
+use candle_core::Tensor;
 use rayon::prelude::*;
 use serde_json::{Map, Value};
 
@@ -27,6 +28,7 @@ use super::{
 use crate::{
     camera::Camera,
     error::{Error, Result},
+    model::file,
     region::REGION_COUNT,
 };
 
@@ -145,6 +147,18 @@ impl Dataset {
             return Err(Error::malformed(self.files.path_of(&entry.image), format!("its camera's {fault}")));
         }
         Ok(entry.camera)
+    }
+
+    /// The depth that `cnerf synth --with depth` left beside the item at `index`, along the view axis in world units,
+    /// `[S, S]`.
+    pub fn depth(&self, index: usize) -> Result<Option<Tensor>> {
+        let Some(name) = self.entry(index)?.extra.get("depth").and_then(|name| name.as_str()) else {
+            return Ok(None);
+        };
+        let path = self.files.path_of(name);
+        let (tensors, _) = file::parse_safetensors(&path, &self.file(name)?)?;
+        let depth = tensors.get("depth").filter(|depth| depth.rank() == 2);
+        depth.cloned().map(Some).ok_or_else(|| Error::malformed(&path, "holds no tensor `depth` [S, S]"))
     }
 
     /// Reads and decodes the item at `index`. The photo must be square and the label map of its size.

@@ -1,7 +1,7 @@
 //! Whether a portrait's views agree: colours, regions and fine detail of one view against another's, carried over by
 //! the rendered depth. Only what both views see of the head counts (see [`super::warp`]).
 
-use candle_core::Tensor;
+use candle_core::{DType, Device, Tensor};
 use serde::Serialize;
 
 use super::{
@@ -9,7 +9,16 @@ use super::{
     subject::Subject,
     warp::{Raster, Surface, Warp},
 };
-use crate::{camera::Camera, data::labels::LabelMap, error::Result, model::generator::Picture};
+use crate::{
+    camera::Camera,
+    data::{
+        dataset::{Dataset, Item},
+        labels::LabelMap,
+        picture,
+    },
+    error::{Error, Result},
+    model::generator::Picture,
+};
 
 /// How far the two views of the reprojection are turned from the middle one, radians.
 pub const REPROJECTION_RAD: f64 = 0.3;
@@ -17,6 +26,8 @@ pub const REPROJECTION_RAD: f64 = 0.3;
 pub const DETAIL_RAD: [f64; 2] = [0.05, 0.4];
 /// Fine detail is what a Gaussian of this share of the picture's width takes away: a pixel of a 64² render.
 const BLUR_SHARE: f64 = 1.0 / 64.0;
+/// A picture of a data set is turned by an angle if it is so to this much, radians.
+const SAME_TURN_RAD: f64 = 1e-3;
 /// Smallest number of pixels that say something.
 const LEAST_PIXELS: usize = 16;
 
@@ -60,21 +71,45 @@ impl Consistency {
             let camera = Camera { azimuth_rad, ..subject.camera };
             View::new(camera, &subject.picture(&camera)?)
         };
-        let middle = view(0.0)?;
-        let turned = [view(-REPROJECTION_RAD)?, view(REPROJECTION_RAD)?];
+        Self::between(&view(0.0)?, |turn_rad| view(turn_rad).map(Some))
+    }
+
+    /// Measures the pictures of one head in a data set that knows their depth: what the same measures say of the truth.
+    /// The first of `views` is the middle; others count if they are turned from it by one of the angles measured
+    /// (`cnerf synth --with depth --turns=-0.4,-0.3,-0.05,0.05,0.3,0.4`). None if the middle view has no depth, regions
+    /// or camera.
+    pub fn of_truth(dataset: &Dataset, views: &[usize]) -> Result<Option<Self>> {
+        let Some((&first, others)) = views.split_first() else { return Ok(None) };
+        let Some(middle) = View::of_truth(dataset, first)? else { return Ok(None) };
+        let turned = |turn_rad: f64| -> Result<Option<View>> {
+            for view in others {
+                let Some(camera) = dataset.camera(*view)? else { continue };
+                let expected = Camera { azimuth_rad: middle.surface.camera().azimuth_rad + turn_rad, ..camera };
+                if (camera.azimuth_rad - expected.azimuth_rad).abs() < SAME_TURN_RAD {
+                    return View::of_truth(dataset, *view);
+                }
+            }
+            Ok(None)
+        };
+        Self::between(&middle, turned).map(Some)
+    }
+
+    /// Measures the view in the middle against those turned by an angle, as far as they are there.
+    fn between(middle: &View, turned: impl Fn(f64) -> Result<Option<View>>) -> Result<Self> {
+        let sides = [turned(-REPROJECTION_RAD)?, turned(REPROJECTION_RAD)?];
         let (mut across, mut from_middle) = (Reprojection::default(), Reprojection::default());
-        let [left, right] = &turned;
-        across.add(left, right)?;
-        across.add(right, left)?;
-        for side in &turned {
-            from_middle.add(side, &middle)?;
+        if let [Some(left), Some(right)] = &sides {
+            across.add(left, right)?;
+            across.add(right, left)?;
+        }
+        for side in sides.iter().flatten() {
+            from_middle.add(side, middle)?;
         }
         let mut detail = [Detail::default(); 2];
         for (detail, turn_rad) in detail.iter_mut().zip(DETAIL_RAD) {
-            let sides =
-                [-turn_rad, turn_rad].map(|azimuth| Ok::<_, crate::Error>(view(azimuth)?.detail(&middle, turn_rad)));
-            let [left, right] = sides;
-            *detail = Detail::mean(&[left?, right?]);
+            let sides = [turned(-turn_rad)?, turned(turn_rad)?];
+            let sides: Vec<Detail> = sides.iter().flatten().map(|view| view.detail(middle, turn_rad)).collect();
+            *detail = Detail { turn_rad, ..Detail::mean(&sides) };
         }
         Ok(Self {
             reprojection_psnr: across.psnr(),
@@ -182,6 +217,25 @@ impl View {
         })
     }
 
+    /// The picture at `index` of a data set, at its own size, if its depth, regions and camera are known.
+    fn of_truth(dataset: &Dataset, index: usize) -> Result<Option<Self>> {
+        let (depth, Item { image, mask, camera }) = (dataset.depth(index)?, dataset.item(index)?);
+        let (Some(depth), Some(labels), Some(camera)) = (depth, mask, camera) else { return Ok(None) };
+        let side = image.width();
+        if depth.dims() != [side as usize; 2] {
+            return Err(Error::shape("depth", [side as usize; 2], depth.dims()));
+        }
+        let head = labels.labels().iter().map(|label| if *label == 0 { 0.0 } else { 1.0 }).collect();
+        let depths = depth.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?;
+        let half = picture::resize_area(&image, side.div_ceil(2), side.div_ceil(2))?;
+        Ok(Some(Self {
+            surface: Surface::of_head(camera, Raster::new(side as usize, vec![depths, head])?),
+            output: Layer::new(&picture::to_tensor(&[image], &Device::Cpu)?)?,
+            field: Layer::new(&picture::to_tensor(&[half], &Device::Cpu)?)?,
+            labels,
+        }))
+    }
+
     /// Compares this view's fine detail with what `source` shows of the same places.
     fn detail(&self, source: &Self, turn_rad: f64) -> Detail {
         let compare = |target: &Layer, found: &Layer| {
@@ -269,8 +323,6 @@ impl Reprojection {
 
 #[cfg(test)]
 mod tests {
-    use candle_core::Device;
-
     use super::*;
     use crate::{
         camera::{FAR, NEAR},

@@ -135,6 +135,16 @@ impl Surface {
         Ok(Self { camera, raster: Raster::new(depth.side, vec![depths, opacities])? })
     }
 
+    /// A surface that is known: `raster` holds the head's depth along the view axis, world units, and its opacity.
+    pub(super) fn of_head(camera: Camera, raster: Raster) -> Self {
+        Self { camera, raster }
+    }
+
+    /// Where it is seen from.
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
     /// The head's depth along the view axis at a point of the picture, world units; none on its outline or beyond.
     pub fn depth(&self, point: [f64; 2]) -> Option<f64> {
         (self.raster.bilinear(1, point) >= OPAQUE).then(|| self.raster.bilinear(0, point))

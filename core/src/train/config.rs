@@ -83,7 +83,7 @@ pub struct WarmupConfig {
     pub samples: usize,
     /// Depths between which samples are placed; the whole of every ray where the background is a region of the volume.
     pub depth_range: [f64; 2],
-    /// Learning rate of field, FiLM and mapping.
+    /// Learning rate of field, FiLM and mapping; 0 holds them, so that codes alone are fitted to a finished field.
     pub learning_rate: f64,
     /// Learning rate of the portraits' codes.
     pub code_learning_rate: f64,

@@ -1,6 +1,8 @@
 //! Stage `warmup`: every training portrait gets a code of its own and is reconstructed from its known camera
 //! (shared/recipe). Random rays of random portraits a step; codes, mapping and field learn together.
 
+use std::sync::Arc;
+
 use candle_core::{DType, Device, Tensor, Var};
 use image::RgbImage;
 
@@ -8,7 +10,7 @@ use crate::{
     camera::{self, Camera},
     codes,
     config::Background,
-    data::{loader::Cached, picture::signed},
+    data::{dataset::Dataset, loader::Cached, picture::signed},
     error::{Error, Result},
     model::{file::Tensors, generator::Generator},
     parameters::Parameters,
@@ -57,6 +59,8 @@ pub struct Warmup {
     portraits: Cached,
     people: People,
     generator: Generator,
+    /// `generator` as the losses see it: without gradients of its weights where these do not learn.
+    reader: Generator,
     log_alpha: Var,
     /// z of every person, then of every mirrored one, `[M, D]`.
     codes: Var,
@@ -108,11 +112,14 @@ impl Warmup {
         let log_alpha = alpha.into_iter().next().map(|(_, variable)| variable);
         let log_alpha = log_alpha.ok_or_else(|| Error::shape("field.log_alpha", [1], &[]))?;
         let group = |variables, learning_rate, bound| Group { variables, learning_rate, largest_gradient_norm: bound };
-        let groups = vec![
-            group(field, stage.learning_rate, Some(stage.gradient_bound)),
-            group(under("mapping"), stage.learning_rate, None),
-            group(vec![(CODES.to_owned(), codes.clone())], stage.code_learning_rate, None),
-        ];
+        let mut groups = vec![group(vec![(CODES.to_owned(), codes.clone())], stage.code_learning_rate, None)];
+        let reader = if stage.learning_rate > 0.0 {
+            groups.insert(0, group(field, stage.learning_rate, Some(stage.gradient_bound)));
+            groups.insert(1, group(under("mapping"), stage.learning_rate, None));
+            generator.clone()
+        } else {
+            Generator::new(generator.config(), &generator.parameters().frozen())?
+        };
         let betas = Betas { first: stage.betas[0], second: stage.betas[1] };
         let optimiser = Adam::new(groups, betas).in_team(&inputs.team);
         inputs.team.portraits(stage.batch, people.count())?;
@@ -125,6 +132,7 @@ impl Warmup {
             portraits,
             people,
             generator,
+            reader,
             log_alpha,
             codes,
             region_codes,
@@ -218,11 +226,11 @@ impl Warmup {
         let config = &self.config;
         let weights = &config.weights;
         let z = self.codes.as_tensor().index_select(&batch.rows, 0)?;
-        let mut codes = codes::broadcast(&self.generator.map(&z)?)?;
+        let mut codes = codes::broadcast(&self.reader.map(&z)?)?;
         if let Some(offsets) = &batch.region_codes {
             codes = (codes + offsets.as_tensor())?;
         }
-        let field = self.generator.field().portraits(&codes)?;
+        let field = self.reader.field().portraits(&codes)?;
         let rays = camera::cast(&batch.cameras, &batch.pixels, batch.resolution, camera::FIELD_OF_VIEW_RAD)?;
         let bundle = RayBundle::new(rays)?;
         let sampling = self.sampling();
@@ -415,6 +423,16 @@ impl StageRun for Warmup {
     }
 }
 
+/// The z a warm-up on `dataset` begins with, `[M, style_dim]`, mirror images after plain ones.
+///
+/// # Errors
+/// Where a picture cannot be read, or there are too few for codes of this length.
+pub fn first_noise(dataset: &Arc<Dataset>, mirror: bool, style_dim: usize, seed: u64) -> Result<Tensor> {
+    let portraits = Cached::new(dataset, &[CODE_RESOLUTION], &|_| ())?;
+    let (features, ..) = describe(&portraits, &People::of(dataset, mirror), &Device::Cpu)?;
+    whiten(&features, style_dim, seed)
+}
+
 /// What first codes are computed from, the mean of a person's views, `[M, F]`; and each region's mean colour `[P, 9, 3]`
 /// and presence `[P, 9]` in every picture.
 fn describe(portraits: &Cached, people: &People, device: &Device) -> Result<(Tensor, Tensor, Tensor)> {
@@ -489,6 +507,31 @@ mod tests {
             let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
             assert_eq!(values(weight), values(&after[name]), "{name}");
         }
+    }
+
+    #[test]
+    fn without_a_learning_rate_codes_alone_are_fitted() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut config = TrainConfig::preset(Preset::Tiny);
+        config.warmup = WarmupConfig { learning_rate: 0.0, region_codes_from: 0.0, steps: 40, ..config.warmup };
+        let (dataset, device, team) = (dataset(folder.path(), 9), Device::Cpu, Team::default());
+        // Codes as long as the tiny preset's need more portraits than these.
+        config.model.field.style_dim = 6;
+        let inputs = Inputs { dataset, perceptual: None, start: None, device, team };
+        let mut stage = Warmup::new(&config, &inputs, None).unwrap();
+        let before = stage.generator.parameters().snapshot().unwrap();
+        let first = stage.codes.as_tensor().copy().unwrap();
+        for step in 0..3 {
+            stage.step(step).unwrap();
+        }
+        let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        for (name, weight) in stage.generator.parameters().snapshot().unwrap() {
+            // α follows its schedule, not a gradient.
+            assert!(name.ends_with("log_alpha") || values(&weight) == values(&before[&name]), "{name} moved");
+        }
+        assert_ne!(values(&first), values(stage.codes.as_tensor()));
+        let offsets = stage.portrait_codes().unwrap().offsets.unwrap();
+        assert!(values(&offsets).iter().any(|value| *value != 0.0));
     }
 
     #[test]

@@ -10,7 +10,6 @@ use cnerf_core::{
         picture,
     },
     eval::warp::Raster,
-    model::file,
     rng::Stream,
 };
 use image::RgbImage;
@@ -176,7 +175,9 @@ impl People {
             Ok(Some(OtherView { camera, image: picture::resize(&image, side, side)?, labels }))
         };
         let others = rest.iter().filter_map(|index| other(index).transpose()).collect::<Result<_>>()?;
-        Ok(Person { name, subject, camera, labels, depth: known_depth(dataset, *first)?, others })
+        let depth = dataset.depth(*first)?.map(|depth| Raster::from_tensor(&depth.unsqueeze(0)?.unsqueeze(0)?));
+        let depth = depth.transpose()?;
+        Ok(Person { name, subject, camera, labels, depth, others })
     }
 }
 
@@ -192,16 +193,4 @@ fn list_photos(folder: &Path) -> Result<Vec<PathBuf>> {
     }
     photos.sort();
     Ok(photos)
-}
-
-/// The depth that `cnerf synth --with depth` left beside an item.
-fn known_depth(dataset: &Dataset, index: usize) -> Result<Option<Raster>> {
-    let Some(name) = dataset.entry(index)?.extra.get("depth").and_then(|name| name.as_str()) else {
-        return Ok(None);
-    };
-    let path = dataset.path().join(name);
-    let (tensors, _) = file::parse_safetensors(&path, &dataset.file(name)?)?;
-    let depth = tensors.get("depth").filter(|depth| depth.rank() == 2);
-    let depth = depth.ok_or_else(|| Error::malformed(&path, "holds no tensor `depth` [S, S]"))?;
-    Ok(Some(Raster::from_tensor(&depth.unsqueeze(0)?.unsqueeze(0)?)?))
 }
