@@ -242,6 +242,10 @@ pub struct UpsamplerStageConfig {
     /// free of specks. Paper: 0.
     #[serde(default)]
     pub calm_detail: f64,
+    /// Weight of the same around outlines, where regions meet: a critic sharpens faces before it sees the rows of dashes
+    /// that stand there. Paper: 0.
+    #[serde(default)]
+    pub calm_outline: f64,
     /// Share of a random portrait's region codes that come from another one, as an edit does it. Above 0, and where there
     /// are pairs, half of the random portraits are training portraits seen from elsewhere. Paper: 0.
     #[serde(default)]
@@ -275,7 +279,8 @@ pub struct UpsamplerStageConfig {
 impl UpsamplerStageConfig {
     /// Whether random portraits teach the generator by themselves, without anybody who judges them.
     pub fn teaches_random_portraits(&self) -> bool {
-        self.agreement > 0.0 || self.calm_background > 0.0 || self.calm_detail > 0.0
+        let calm = [self.calm_background, self.calm_detail, self.calm_outline];
+        self.agreement > 0.0 || calm.iter().any(|weight| *weight > 0.0)
     }
 }
 

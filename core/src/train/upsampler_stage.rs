@@ -215,11 +215,13 @@ impl UpsamplerStage {
             metrics.push_loss("agreement", &loss)?;
             terms.push((loss * config.agreement)?);
         }
-        if config.calm_background > 0.0 || config.calm_detail > 0.0 {
+        if config.calm_background > 0.0 || config.calm_detail > 0.0 || config.calm_outline > 0.0 {
             let calm = Calm::of(&output, &frame.colour)?;
             metrics.push_loss("background", &calm.background)?;
             metrics.push_loss("detail", &calm.detail)?;
-            terms.push(((calm.background * config.calm_background)? + (calm.detail * config.calm_detail)?)?);
+            metrics.push_loss("outline", &calm.outline)?;
+            let inside = ((calm.detail * config.calm_detail)? + (calm.outline * config.calm_outline)?)?;
+            terms.push(((calm.background * config.calm_background)? + inside)?);
         }
         let judged = match factor {
             1 => Judged { image: output.rgb, masks: output.masks },
@@ -478,7 +480,8 @@ mod tests {
         let with_pairs = vec!["adversarial=0.1", "discriminator_ahead_steps=2", "random_portraits=1"];
         let alone = vec!["adversarial=1", "pixels=0", "discriminator_ahead_steps=1", "random_portraits=2"];
         let criticised = vec!["critic=0.1", "discriminator_ahead_steps=1", "random_portraits=1"];
-        let calm = vec!["random_portraits=1", "calm_background=1", "calm_detail=1", "exchanged_codes=0.5"];
+        let calm =
+            vec!["random_portraits=1", "calm_background=1", "calm_detail=1", "calm_outline=1", "exchanged_codes=0.5"];
         let agreeing = vec!["adversarial=0.1", "discriminator_ahead_steps=0", "random_portraits=2", "agreement=1"];
         let augmented = vec![
             "adversarial=0.1",
@@ -491,7 +494,7 @@ mod tests {
             (with_pairs, &["pixels", "discriminator", "adversarial"][..]),
             (alone, &["discriminator", "adversarial"][..]),
             (criticised, &["pixels", "perceptual", "critic", "criticised"][..]),
-            (calm, &["pixels", "background", "detail"][..]),
+            (calm, &["pixels", "background", "detail", "outline"][..]),
             (agreeing, &["pixels", "discriminator", "adversarial", "agreement"][..]),
             (augmented, &["adversarial", "real_sign", "augment_probability"][..]),
         ] {

@@ -90,6 +90,7 @@ impl TrainConfig {
                 agreement: 1.0,
                 calm_background: 1.0,
                 calm_detail: 25.0,
+                calm_outline: 0.0,
                 exchanged_codes: 0.2,
                 agreement_turn_rad: 0.5,
                 discriminator_ahead_steps: 200,
@@ -165,6 +166,7 @@ impl TrainConfig {
             agreement: 0.0,
             calm_background: 0.0,
             calm_detail: 0.0,
+            calm_outline: 0.0,
             exchanged_codes: 0.0,
             agreement_turn_rad: 0.5,
             discriminator_ahead_steps: 0,
@@ -221,6 +223,7 @@ impl TrainConfig {
                 agreement: 0.0,
                 calm_background: 0.0,
                 calm_detail: 0.0,
+                calm_outline: 0.0,
                 exchanged_codes: 0.0,
                 random_portraits: 2,
                 ..small.upsampler

@@ -15,10 +15,14 @@ pub(super) struct Calm {
     /// Mean squared Laplacian of the difference over all but [`DETAILED`]: a lone dark pixel costs sixteen times its
     /// square, a shade over several pixels next to nothing.
     pub detail: Tensor,
+    /// The same around outlines, where the head's parts and the background meet: rows of dark dashes like to stand there.
+    pub outline: Tensor,
 }
 
 /// Regions that live by their detail: eyes, eyebrows, mouth, nose.
 const DETAILED: [Region; 4] = [Region::Eyes, Region::Eyebrows, Region::Mouth, Region::Nose];
+/// An outline is as broad as this to either side, pixels.
+const OUTLINE_REACH: usize = 4;
 
 impl Calm {
     /// Of pictures and their renders `[B, 3, r, r]`.
@@ -31,17 +35,39 @@ impl Calm {
         let masks = picture.masks.detach();
         let mask = |region: Region| masks.narrow(1, region as usize, 1);
         let background = mask(Region::Background)?;
-        let mut plain = background.ones_like()?;
+        let mut detailed = background.zeros_like()?;
         for region in DETAILED {
-            plain = (plain - mask(region)?)?;
+            detailed = (detailed + mask(region)?)?;
         }
+        let plain = detailed.affine(-1.0, 1.0)?;
+        let outline = (outline(&masks, &detailed)? * &plain)?;
         let mean_over = |values: Tensor, area: &Tensor| -> Result<Tensor> {
             // At least a pixel's worth: a square may show none of it.
             Ok(values.mean_keepdim(1)?.mul(area)?.sum_all()?.div(&(area.sum_all()? + 1.0)?)?)
         };
         let curved = laplacian(&added)?.sqr()?;
-        Ok(Self { background: mean_over(added.abs()?, &background)?, detail: mean_over(curved, &inner(&plain)?)? })
+        Ok(Self {
+            background: mean_over(added.abs()?, &background)?,
+            outline: mean_over(curved.clone(), &inner(&outline)?)?,
+            detail: mean_over(curved, &inner(&plain)?)?,
+        })
     }
+}
+
+/// 1 along the lines where regions meet, 0 away from them, `[B, 1, H, W]`; `detailed` regions count as face.
+fn outline(masks: &Tensor, detailed: &Tensor) -> Result<Tensor> {
+    let mask = |region: Region| masks.narrow(1, region as usize, 1);
+    let mut squares = (mask(Region::Face)? + detailed)?.sqr()?;
+    for region in [Region::Background, Region::Ears, Region::Hair, Region::Neck] {
+        squares = (squares + mask(region)?.sqr()?)?;
+    }
+    // Where one region has it all, the squares of the shares sum to 1.
+    let mixed = squares.affine(-1.0, 1.0)?;
+    let mixed = mixed.pad_with_same(2, OUTLINE_REACH, OUTLINE_REACH)?.pad_with_same(3, OUTLINE_REACH, OUTLINE_REACH)?;
+    let side = 2 * OUTLINE_REACH + 1;
+    let share = mixed.contiguous()?.avg_pool2d_with_stride((side, side), (1, 1))?;
+    // A line a pixel wide, half one region's and half another's, crosses `side` of the square's pixels.
+    Ok((share * (2 * side) as f64)?.clamp(0.0, 1.0)?)
 }
 
 /// All but the outermost pixels.
@@ -76,6 +102,7 @@ mod tests {
                 masks: Tensor::from_vec(masks, (1, 9, 16, 16), &Device::Cpu).unwrap(),
             };
             let calm = Calm::of(&output, &render).unwrap();
+            assert_eq!(calm.outline.to_scalar::<f32>().unwrap(), 0.0, "one region has no outlines");
             (calm.background.to_scalar::<f32>().unwrap(), calm.detail.to_scalar::<f32>().unwrap())
         };
         let speck = |row: usize, column: usize| if (row, column) == (8, 7) { -0.3 } else { 0.0 };
@@ -88,5 +115,25 @@ mod tests {
         assert_eq!(cost(Region::Eyes, &speck).1, 0.0);
         let (background, detail) = cost(Region::Background, &speck);
         assert!((background - 0.3 / 257.0).abs() < 1e-6 && detail > 0.0, "{background} {detail}");
+    }
+
+    #[test]
+    fn outlines_are_where_regions_meet_and_eyes_have_none() {
+        // Hair to the left of column 8, face to the right, an eye in its middle.
+        let region = |row: usize, column: usize| match (row, column) {
+            (_, 0..8) => Region::Hair,
+            (7..9, 23..25) => Region::Eyes,
+            _ => Region::Face,
+        };
+        let masks: Vec<f32> =
+            (0..9 * 512).map(|at| f32::from(at / 512 == region(at % 512 / 32, at % 32) as usize)).collect();
+        let masks = Tensor::from_vec(masks, (1, 9, 16, 32), &Device::Cpu).unwrap();
+        // Finished masks are enlarged ones: no line is sharper than two pixels.
+        let masks = Resampling::BilinearUp.apply(&masks).unwrap();
+        let eyes = masks.narrow(1, Region::Eyes as usize, 1).unwrap();
+        let found = outline(&masks, &eyes).unwrap().squeeze(0).unwrap().squeeze(0).unwrap().to_vec2::<f32>().unwrap();
+        assert_eq!((found.len(), found[0].len()), (32, 64));
+        assert!(found.iter().all(|row| row[13] > 0.9 && row[18] > 0.9), "{:?}", found[16]);
+        assert!(found.iter().all(|row| row[4] == 0.0 && row[28..].iter().all(|value| value.abs() < 1e-5)));
     }
 }
