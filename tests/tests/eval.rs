@@ -35,6 +35,7 @@ fn quality_without_features_compares_sharpness_and_regions() {
     assert!((0.0..=1.0).contains(&number(&report, "mask_miou")), "{report}");
     assert_eq!(number(&report["reconstruction"], "count"), 4.0);
     assert!(number(&report["reconstruction"], "render_psnr") > 8.0, "{report}");
+    assert!(number(&report["reconstruction"]["sharpness"], "real") > 0.0, "{report}");
     for chart in ["sharpness", "nyquist", "regions"] {
         assert!(is_chart(&folder, &format!("charts/{chart}.svg")), "{chart}");
     }

@@ -82,10 +82,10 @@ impl Consistency {
         let Some((&first, others)) = views.split_first() else { return Ok(None) };
         let Some(middle) = View::of_truth(dataset, first)? else { return Ok(None) };
         let turned = |turn_rad: f64| -> Result<Option<View>> {
+            let azimuth_rad = middle.surface.camera().azimuth_rad + turn_rad;
             for view in others {
                 let Some(camera) = dataset.camera(*view)? else { continue };
-                let expected = Camera { azimuth_rad: middle.surface.camera().azimuth_rad + turn_rad, ..camera };
-                if (camera.azimuth_rad - expected.azimuth_rad).abs() < SAME_TURN_RAD {
+                if (camera.azimuth_rad - azimuth_rad).abs() < SAME_TURN_RAD {
                     return View::of_truth(dataset, *view);
                 }
             }

@@ -46,15 +46,26 @@ pub struct RealismOptions {
     pub seed: u64,
 }
 
-/// A number of random portraits and the same of photos.
+/// A number of a model's portraits and the same of photos.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Compared {
-    /// Mean of the random portraits.
+    /// Mean of the portraits.
     pub generated: f64,
     /// Mean of the photos.
     pub real: f64,
     /// Generated over real.
     pub share: f64,
+}
+
+impl Compared {
+    fn of(generated: &[f64], real: &[f64]) -> Self {
+        let (generated, real) = (mean(generated), mean(real));
+        Self { generated, real, share: generated / real.max(f64::MIN_POSITIVE) }
+    }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
 /// What was found.
@@ -247,11 +258,6 @@ struct Found {
 }
 
 fn compared(real: Gathered, generated: Gathered) -> Found {
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
-    let compare = |generated: &[f64], real: &[f64]| {
-        let (generated, real) = (mean(generated), mean(real));
-        Compared { generated, real, share: generated / real.max(f64::MIN_POSITIVE) }
-    };
     let maps = Region::ALL.map(|region| (region, generated.mean_mask(region), real.mean_mask(region)));
     let overlap = |a: &[f64], b: &[f64]| {
         let (least, most) = a.iter().zip(b).fold((0.0, 0.0), |(l, m), (a, b)| (l + a.min(*b), m + a.max(*b)));
@@ -265,8 +271,8 @@ fn compared(real: Gathered, generated: Gathered) -> Found {
         real: real.as_deref().map(mean),
     });
     let report = Realism {
-        sharpness: compare(&generated.sharpness, &real.sharpness),
-        nyquist: compare(&generated.nyquist, &real.nyquist),
+        sharpness: Compared::of(&generated.sharpness, &real.sharpness),
+        nyquist: Compared::of(&generated.nyquist, &real.nyquist),
         region_map_overlap: (!overlaps.is_empty()).then(|| mean(&overlaps)),
         regions: regions.collect(),
         values: Values { sharpness: [generated.sharpness, real.sharpness], nyquist: [generated.nyquist, real.nyquist] },
@@ -305,6 +311,8 @@ pub struct Reconstruction {
     pub mask_miou: Option<f64>,
     /// Mean perceptual distance, if weights are there.
     pub lpips: Option<f64>,
+    /// Sharpness of the finished pictures and of the very photos they show.
+    pub sharpness: Compared,
 }
 
 /// Whether there is a code for everyone on the photos of `dataset`, or for them and their mirror images.
@@ -332,21 +340,25 @@ pub fn reconstruction(
     let people = People::of(dataset, false);
     let (device, resolution) = (generator.device(), generator.output_resolution());
     let (mut found, mut agreement, mut distance) = (Reconstruction::default(), Agreement::default(), 0.0);
-    let mut masked = false;
+    let (mut sharpness, mut masked) = ([Vec::new(), Vec::new()], false);
     let perceptual = features.and_then(PictureFeatures::perceptual);
     for index in chosen(dataset, options) {
         let Item { image, mask, camera } = dataset.item(index)?;
         let row = people.row(Draw { index, mirrored: false }) as u32;
         let codes = portraits.codes(generator, &[row])?.detach();
         let shown = picture_of(generator, &codes, None, &camera.unwrap_or_default())?;
-        let psnr = |rgb: &Tensor, side: usize| -> Result<f64> {
-            Ok(quality::psnr(rgb, &at(&image, side, &device)?)?.first().copied().unwrap_or_default())
+        let psnr = |rgb: &Tensor, photo: &Tensor| -> Result<f64> {
+            Ok(quality::psnr(rgb, photo)?.first().copied().unwrap_or_default())
         };
+        let photo = at(&image, resolution, &device)?;
+        for (values, rgb) in sharpness.iter_mut().zip([&shown.rgb, &photo]) {
+            values.extend(quality::laplacian_deviation(rgb)?);
+        }
         found.count += 1;
-        found.psnr += psnr(&shown.rgb, resolution)?;
-        found.render_psnr += psnr(&shown.frame.colour, generator.render_resolution())?;
+        found.psnr += psnr(&shown.rgb, &photo)?;
+        found.render_psnr += psnr(&shown.frame.colour, &at(&image, generator.render_resolution(), &device)?)?;
         if let Some(perceptual) = perceptual {
-            let lpips = perceptual.distance(&shown.rgb, &at(&image, resolution, &device)?)?;
+            let lpips = perceptual.distance(&shown.rgb, &photo)?;
             distance += lpips.to_vec1::<f32>()?.first().copied().map_or(0.0, f64::from);
         }
         if let Some(mask) = mask {
@@ -355,8 +367,10 @@ pub fn reconstruction(
             agreement.add(&mask.resized(found.width(), found.height())?, &found)?;
         }
     }
+    let [shown, photos] = &sharpness;
     let count = found.count.max(1) as f64;
     Ok(Reconstruction {
+        sharpness: Compared::of(shown, photos),
         psnr: found.psnr / count,
         render_psnr: found.render_psnr / count,
         mask_miou: if masked { agreement.mean_iou() } else { None },

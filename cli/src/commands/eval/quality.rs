@@ -255,7 +255,12 @@ fn summary(report: &Report) -> String {
         let lpips = shown(found.lpips, 3);
         rows.push((
             "from codes",
-            format!("render {:.2} dB, picture {:.2} dB, LPIPS {lpips}", found.render_psnr, found.psnr),
+            format!(
+                "render {:.2} dB, picture {:.2} dB, LPIPS {lpips}, sharpness {}",
+                found.render_psnr,
+                found.psnr,
+                of_real(found.sharpness)
+            ),
         ));
     }
     table(&rows)
